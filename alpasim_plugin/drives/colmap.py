@@ -40,7 +40,7 @@ SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
 _NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
     SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"""
 MODELS = _NAMES.split()
-NUMBERS = {"CAMERA": CAMERA, "IMU": 1, **{name: i for i, name in enumerate(MODELS)}}
+NUMBERS = {"CAMERA": CAMERA, "IMU": 1}  # of kinds of sensors
 PARAMETERS = {  # focal lengths and middle, then OpenCV's coefficients
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
@@ -232,6 +232,11 @@ class _Binary:
         self.at = end + 1
         return text
 
+    def model(self) -> str:
+        """Return the name of a lens model, or its number where it is a new one."""
+        number = self.take("i")[0]
+        return MODELS[number] if 0 <= number < len(MODELS) else f"number {number}"
+
     def skip(self, size: int) -> None:
         """Skip a list of things of a size, which begins with their number."""
         count = self.take("Q")[0]
@@ -251,6 +256,10 @@ class _Words:
         pairs = zip(form, words, strict=True)
         return tuple(float(w) if kind == "d" else int(NUMBERS.get(w, w)) for kind, w in pairs)
 
+    def model(self) -> str:
+        """Return the name of a lens model."""
+        return next(self.words)
+
     def name(self) -> str:
         return next(self.words).strip()
 
@@ -259,13 +268,14 @@ class _Words:
 
 
 def _camera(reader: _Binary | _Words) -> tuple[int, Lens]:
-    number, model, width, height = reader.take("iiQQ")
-    name = MODELS[model] if model < len(MODELS) else f"number {model}"
+    number = reader.take("i")[0]
+    name = reader.model()
     if name not in PARAMETERS:
         raise InputError(
             f"camera model {name}: a lens that is not read, only {', '.join(PARAMETERS)}",
             "undistort the images (colmap image_undistorter)",
         )
+    width, height = reader.take("QQ")
     p = reader.take("d" * PARAMETERS[name])
     if name in ONE_FOCAL:
         p = (p[0], *p)

@@ -114,10 +114,10 @@ def test_the_largest_of_several_colmap_models_is_read_and_said(tmp_path):
     assert any("2 models" in note and "sparse/10" in note for note in drive.notes)
 
 
-@pytest.mark.parametrize("name", ["FOV", "THIN_PRISM_FISHEYE", "NEWEST"])
+@pytest.mark.parametrize("name", ["FOV", "THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "NEWEST"])
 def test_a_lens_of_colmap_that_is_not_read_is_named(tmp_path, name):
     colmap(tmp_path / "sparse", ["a.png"], camera=f"{name} 320 128 180 180 160 54 0.1")
-    with pytest.raises(InputError, match=name):
+    with pytest.raises(InputError, match=f"camera model {name}: a lens that is not read"):
         read_source(tmp_path, need_files=False)
 
 
@@ -174,6 +174,33 @@ def test_a_fisheye_of_instant_ngp_and_unknown_keys(tmp_path):
     drive = read_source(folder, need_files=False)
     assert drive.photographs[0].lens.model == "fisheye"
     assert "wobble" in str(drive.notes)
+
+
+WIDE, TALL = 2 * np.arctan(160 / 180), 2 * np.arctan(64 / 150)
+
+
+@pytest.mark.parametrize(
+    ("keys", "focal"),
+    [
+        ({"camera_angle_x": WIDE, "camera_angle_y": TALL}, (180, 150)),
+        ({"camera_angle_x": WIDE}, (180, 180)),
+        ({"camera_angle_y": TALL}, (150, 150)),
+        ({"camera_angle_x": WIDE, "camera_angle_y": TALL, "fl_y": 170}, (180, 170)),
+        ({"fl_x": 190, "camera_angle_x": WIDE, "camera_angle_y": TALL}, (190, 150)),
+        ({"x_fov": np.rad2deg(WIDE), "y_fov": np.rad2deg(TALL)}, (180, 150)),
+    ],
+)
+def test_focal_lengths_by_angles_of_view(tmp_path, keys, focal):
+    folder = transforms(tmp_path / "a", NAMES)
+    file = folder / "transforms.json"
+    document = json.loads(file.read_text())
+    for holder in (document, *document["frames"]):
+        for key in ("fl_x", "fl_y"):
+            holder.pop(key, None)
+    size = {"w": 320, "h": 128}
+    file.write_text(json.dumps({**document, **size, **keys}))
+    K = read_source(folder, need_files=False).photographs[0].lens.K
+    assert (K[0, 0], K[1, 1]) == pytest.approx(focal)
 
 
 def test_masks_of_frames_are_noted_since_they_are_not_used(tmp_path):

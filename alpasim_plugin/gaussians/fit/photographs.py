@@ -13,9 +13,9 @@ through their converters, for example):
 ``transform_matrix`` maps camera points to the world. ``axes`` says how the camera's axes lie:
 ``opencv`` is x right, y down, z forward; ``opengl`` is x right, y up, z back (what Instant-NGP and
 nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3; with
-``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x``,
-radians, may stand for the focal length. Images are freed of their distortion as they are read.
-Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
+``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x`` and
+``camera_angle_y``, radians, or ``x_fov`` and ``y_fov``, degrees, may stand for the focal lengths.
+Images are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
 names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
@@ -259,6 +259,27 @@ def _photograph(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -
     )
 
 
+def _focal_lengths(frame: Mapping[str, Any], width: int, height: int) -> tuple[float, float]:
+    """Return both focal lengths, pixels: as written, else by an angle of view in radians
+    (``camera_angle_x``) or degrees (``x_fov``), each axis by its own, as Instant-NGP reads them; an
+    axis without any has that of the other one.
+
+    Raises:
+        KeyError: Neither axis has one.
+    """
+    lengths = {}
+    for axis, size in (("x", width), ("y", height)):
+        if f"fl_{axis}" in frame:
+            lengths[axis] = float(frame[f"fl_{axis}"])
+        elif f"camera_angle_{axis}" in frame:
+            lengths[axis] = 0.5 * size / np.tan(0.5 * float(frame[f"camera_angle_{axis}"]))
+        elif f"{axis}_fov" in frame:
+            lengths[axis] = 0.5 * size / np.tan(0.5 * np.deg2rad(float(frame[f"{axis}_fov"])))
+    if not lengths:
+        raise KeyError("fl_x")
+    return lengths.get("x", lengths.get("y", np.nan)), lengths.get("y", lengths.get("x", np.nan))
+
+
 def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
     model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
     undistort = "undistort the images first (colmap image_undistorter)"
@@ -281,17 +302,10 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
         )
         width = int(size[0])
         height = int(size[1])
-        if "fl_x" not in frame and "camera_angle_x" in frame:
-            focal = 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
-            frame = {"fl_y": focal, "cx": width / 2, "cy": height / 2, **frame, "fl_x": focal}
-        K = np.array(
-            [
-                [frame["fl_x"], 0, frame["cx"]],
-                [0, frame.get("fl_y", frame["fl_x"]), frame["cy"]],
-                [0, 0, 1],
-            ],
-            np.float64,
-        )
+        fl_x, fl_y = _focal_lengths(frame, width, height)
+        if "fl_x" not in frame:  # angles are those of a camera that looks out of its middle
+            frame = {"cx": width / 2, "cy": height / 2, **frame}
+        K = np.array([[fl_x, 0, frame["cx"]], [0, fl_y, frame["cy"]], [0, 0, 1]], dtype=np.float64)
         distortion = np.array(
             [float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0]
         )
