@@ -5,6 +5,7 @@ Every file is made here.
 """
 
 import gzip
+import itertools
 import json
 import struct
 
@@ -13,8 +14,10 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.cloud import GaussianArrays, build_cloud
 from alpasim_plugin.gaussians.constants import EPS2D_PX2, MIP_PX2
 from alpasim_plugin.gaussians.files import read_gaussians
+from alpasim_plugin.gaussians.files.packed import in_ply_axes
 from alpasim_plugin.gaussians.files.ply import ply_rows, read_ply_arrays, write_ply
 from alpasim_plugin.gaussians.fit.photographs import read_points
 from alpasim_plugin.gaussians.raster.rasterize import rasterize
@@ -63,6 +66,16 @@ def test_a_property_of_which_nothing_is_drawn_is_skipped(tmp_path, name):
     cloud, report = opened(model(tmp_path / "b.ply", {name: 0.5}))
     assert np.array_equal(cloud.scales, plain.scales)
     assert not report.notes
+
+
+def test_a_property_that_is_neutral_in_every_row_changes_nothing(tmp_path):
+    plain, _ = opened(model(tmp_path / "a.ply"))
+    for name in ("transform", "motion_0"):
+        same, report = opened(model(tmp_path / "b.ply", {name: 0.0}))
+        assert np.array_equal(same.means, plain.means)
+        assert any(name in note for note in report.notes)
+        with pytest.raises(InputError, match=name):
+            opened(model(tmp_path / "c.ply", {name: 1.0}))
 
 
 @pytest.mark.parametrize("name", ["opacity", "scale_2"])
@@ -240,7 +253,7 @@ AXES |= {"L": -AXES["R"], "U": -AXES["D"], "B": -AXES["F"]}
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize(
     ("number", "system"),
-    [(1, "LDB"), (4, "RUB"), (6, "RDF"), (7, "LUF"), (8, "RUF"), (12, "RFU"), (16, "RBU")],
+    [(1, "LDB"), (4, "RUB"), (6, "RDF"), (7, "LUF"), (8, "RUF"), (12, "RFU"), (14, "RBD")],
 )
 def test_axes_that_an_spz_states_are_turned_into_those_of_a_ply(tmp_path, version, number, system):
     stored, _ = opened(write_spz(tmp_path / "a.spz", version, 2, record(0xADBE0003, 6)))
@@ -254,6 +267,39 @@ def test_axes_that_an_spz_states_are_turned_into_those_of_a_ply(tmp_path, versio
     after = np.einsum("dk,nkc->dnc", sh_basis(rays @ M.T, 9), turned.sh)
     assert np.allclose(after, before, atol=1e-5)
     assert any(system in note for note in report.notes) == (number != 4)
+
+
+SYSTEMS_48 = [
+    "".join(letters)
+    for axes in itertools.permutations(("RL", "DU", "FB"))
+    for letters in itertools.product(*axes)
+]
+
+
+def test_all_48_systems_of_axes_are_one_matrix_of_letters(tmp_path):
+    assert len(SYSTEMS_48) == 48
+    plain_spz(tmp_path / "a.spz", 3, 6, 2, body_streams(3, 6, 2))
+    cloud, _ = opened(tmp_path / "a.spz")
+    columns = (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+    stored = GaussianArrays(*(np.asarray(column) for column in columns))
+    rays = np.random.default_rng(1).normal(size=(20, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    before = np.einsum("dk,nkc->dnc", sh_basis(rays, 9), stored.sh)
+    for system in SYSTEMS_48:
+        M = np.stack([AXES[letter] for letter in system], axis=1)
+        turned = in_ply_axes(stored, system)
+        assert np.allclose(turned.means, stored.means @ M.T, atol=1e-5)
+        turned_cloud, _ = build_cloud(turned)
+        expected = M @ covariances(cloud) @ M.T
+        assert np.allclose(covariances(turned_cloud), expected, rtol=1e-4, atol=1e-9)
+        after = np.einsum("dk,nkc->dnc", sh_basis(rays @ M.T, 9), turned.sh)
+        assert np.allclose(after, before, atol=1e-5)
+
+
+@pytest.mark.parametrize(("number", "system"), [(9, "LFD"), (10, "RFD"), (15, "LBU"), (16, "RBU")])
+def test_axes_that_the_library_of_spz_takes_otherwise_are_refused(tmp_path, number, system):
+    with pytest.raises(InputError, match=system):
+        opened(write_spz(tmp_path / "a.spz", 3, 2, record(0xADBE0003, number)))
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])

@@ -204,6 +204,9 @@ MOST_EXTENDED = 1 << 16  # bytes of extensions
 SYSTEMS = (
     "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()  # noqa: SIM905
 )
+# What the format's own library, and splat-transform after it, write and read under these numbers is
+# turned by 180 degrees about x from what their letters say: no file tells which one is meant.
+CONTRADICTORY = ("LFD", "RFD", "LBU", "RBU")
 # Right, down and front are the axes of a PLY.
 DIRECTIONS = {
     "R": (1, 0, 0),
@@ -277,7 +280,7 @@ def read_spz(path: Path | str) -> GaussianArrays:
     notes: tuple[str, ...] = ()
     if system != SYSTEMS[0]:
         notes = (f"axes {system} as the file states them, turned into those of a PLY",)
-    arrays = _in_ply_axes(_decode(header, streams), system)
+    arrays = in_ply_axes(_decode(header, streams), system)
     antialias_px2 = EPS2D_PX2 if header.flags & ANTIALIASED else 0.0
     return arrays._replace(notes=notes, antialias_px2=antialias_px2)
 
@@ -291,15 +294,25 @@ def _stated_axes(path: Path, data: bytes) -> str:
             kind, size = struct.unpack_from("<II", data, at)
             if kind == AXES:
                 system = SYSTEMS[struct.unpack_from("<I", data, at + 8)[0]]
+        if system in CONTRADICTORY:
+            raise _failure(
+                path,
+                f"axes {system}, which the library of SPZ and the letters take for two different ones",
+                "export it with axes RUB or RDF",
+            )
         if kind not in (AXES, ORBIT):
             raise _failure(path, f"extension {kind:#010x} of unknown meaning", "export it without")
         at += 8 + size
     return system
 
 
-def _in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
+def in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
     """Return Gaussians in the axes of a 3DGS PLY: a left-handed system is mirrored along x, then all
     is turned.
+
+    Args:
+        arrays: Gaussians.
+        system: Where their x, y and z point, such as ``RUB``: a letter of each pair of `DIRECTIONS`.
     """
     M = np.array([DIRECTIONS[letter] for letter in system], np.float64).T
     means, quats, sh = arrays.means, arrays.quats, arrays.sh

@@ -44,6 +44,9 @@ _HARMLESS = re.compile(
     r"n[xyz]|red|green|blue|id|ins_feat_[rgb]2?|(obj_dc|ins_feat|semantic|language|language_feature)_\d+"
     r"|(semantic|label|class|object|instance|segment)(_id)?"
 )
+# Properties that change nothing where they have one value in every row: SuperSplat's number of a
+# transform and its marks of hidden Gaussians, and motions.
+_NEUTRAL = {"transform": 0.0, "state": 0.0, "motion": 0.0, "omega": 0.0}
 # Elements beside a model: its training camera, as Apple's SHARP writes it.
 _BESIDE = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "version", "color_space"}
 _FLAT = 1e-3  # thickness of a 2D Gaussian, in its smaller scale
@@ -79,7 +82,7 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     """Read a Gaussian PLY file without dropping anything; see `read_ply`."""
     header = read_ply_header(path)
     chosen = header.element(element) if element is not None else _only_gaussian_element(header)
-    n_rest = _check_properties(header, chosen)
+    n_rest, unsure = _check_properties(header, chosen)
     for beside in header.elements:  # refuse what may change what is drawn
         linear = beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]
         known = beside.name.startswith("vertex") or beside.name in _BESIDE
@@ -91,6 +94,9 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
             )
     rows = read_ply_element(header, chosen.name)
     notes = stated_in(header)
+    if unsure:
+        _check_neutral(header, chosen, rows, unsure)
+        notes += (f"of no effect, since it has one value in every row: {some_of(unsure)}",)
     flat = "scale_2" not in chosen.properties
     with np.errstate(over="ignore"):  # overflow becomes infinity, which cleaning drops and counts
         scales = np.exp(_columns(rows, _SCALES[: 2 if flat else 3]).astype(np.float64))
@@ -224,8 +230,27 @@ def _only_gaussian_element(header: PlyHeader) -> PlyElement:
     )
 
 
-def _check_properties(header: PlyHeader, element: PlyElement) -> int:
-    """Return the number of coefficients per channel beyond the constant one."""
+def _neutral_of(name: str) -> float | None:
+    """Return the value with which a property changes nothing; None where none is known."""
+    return _NEUTRAL.get(re.sub(r"_\d+$", "", name))
+
+
+def _check_neutral(
+    header: PlyHeader, element: PlyElement, rows: NDArray[np.void], names: Sequence[str]
+) -> None:
+    """Refuse properties that are not neutral in every row."""
+    changing = [name for name in names if not (rows[name] == _neutral_of(name)).all()]
+    if changing:
+        raise InputError(
+            f"{header.path}, element {element.name!r}: properties that change what is drawn: {some_of(changing)}",
+            "export a plain 3DGS model, with transforms and motions applied",
+        )
+
+
+def _check_properties(header: PlyHeader, element: PlyElement) -> tuple[int, list[str]]:
+    """Return the number of coefficients per channel beyond the constant one, and the properties that
+    must have their neutral value.
+    """
     have = set(element.properties)
     missing = [name for name in _REQUIRED if name not in have]
     if missing:
@@ -234,11 +259,12 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
             "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
     known = {*_REQUIRED, *_SCALES, "filter_3D", "filter_3d"}
-    unknown = sorted(
+    strange = sorted(
         name
         for name in have - known
         if not name.startswith("f_rest_") and _HARMLESS.fullmatch(name) is None
     )
+    unknown = [name for name in strange if _neutral_of(name) is None]
     if unknown:
         raise InputError(
             f"{header.path}, element {element.name!r}: properties that may change what is drawn: {some_of(unknown)}",
@@ -259,7 +285,7 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> int:
             f"{header.path}, element {element.name!r}: {n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
             "export the file again with whole bands of spherical harmonics",
         )
-    return per_channel
+    return per_channel, strange
 
 
 def _columns(rows: NDArray[np.void], names: Sequence[str]) -> FloatArray:
