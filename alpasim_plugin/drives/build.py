@@ -21,6 +21,7 @@ from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
+from alpasim_plugin.drives.held_out import fitted_part, held_out, measured
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import (
@@ -48,10 +49,6 @@ SCENARIO_FILE = "scenario.yaml"
 KEY_FILE = "import.json"
 FIT_FOLDER = "fit"
 POINTS_FILE = "points.ply"
-EVERY, EVERY_STILL = (
-    8,
-    5,
-)  # one photograph of so many is held out; of those that were not taken along a road, which are fewer
 FIT_PX = 608  # least longer side of fitted views; half of the photograph's where that is more
 RENDER_PX, SIDE_PX = (
     640,
@@ -160,9 +157,14 @@ def _built(
     device: str,
 ) -> JsonObject:
     """Place, fit and measure a drive, and write all of it into a working folder."""
-    tell("correcting poses", 0, 1)
-    drive = with_corrected_poses(drive)
-    placed = place(drive, _points(drive, folder, tell), camera_height_m)
+
+    def placed_by(every: int) -> tuple[SourceDrive, PlacedDrive]:
+        tell("correcting poses", 0, 1)
+        moved = with_corrected_poses(drive, every)
+        points = _points(fitted_part(moved, every), folder, tell)
+        return moved, place(moved, points, camera_height_m)
+
+    drive, placed, every = measured(placed_by)
     check_motion(drive, placed)
     roads, notes = (
         given_map(map_file, drive, placed)
@@ -170,7 +172,7 @@ def _built(
         else (corridor(placed.ego, placed.ground), (NO_MAP,))
     )
     drive = replace(drive, notes=(*drive.notes, *notes))
-    shown = shown_photographs(drive, placed)
+    shown = shown_photographs(drive, placed, every)
     begin(work, key)
     write_photographs(work, shown, tell)
     actors = placed.actors
@@ -183,7 +185,7 @@ def _built(
     done = fit_drive(
         views["fitted"],
         cloud_from_points(near.xyz, near.rgb),
-        kept=views["held-out"],
+        kept={view.name: view.camera for view in views["held-out"]},
         boxes={one.actor_id: one.box for one in actors if one.actor_id in seen},
         scene_id=scene_id_of(drive),
         folder=work / FIT_FOLDER,
@@ -307,8 +309,8 @@ def begin(work: Path, key: str) -> None:
 
 
 def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
-    """Return the drive's points, in its frame: given, or triangulated; and the road's own, which
-    features miss.
+    """Return the points of a drive without what is held out, in its frame: given, or triangulated;
+    and the road's own, which features miss.
     """
     front = drive.of(drive.front)
     if drive.points is not None:
@@ -327,29 +329,20 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     )
 
 
-def shown_photographs(drive: SourceDrive, placed: PlacedDrive) -> list[Shown]:
-    """Return all photographs with their names, uses and places."""
-    every = EVERY if placed.strip else EVERY_STILL
+def shown_photographs(drive: SourceDrive, placed: PlacedDrive, every: int) -> list[Shown]:
+    """Return all photographs with their names, uses and places; one of ``every`` is held out."""
     out = []
     for camera in drive.cameras:
         name = _name_of(drive, camera)
+        held = held_out(drive, camera, every)
+        usual = "never-fitted" if camera in drive.never_fitted else "fitted"
         for i, one in enumerate(drive.of(camera)):
-            held = i % every == every // 2 and len(drive.of(camera)) >= EVERY
-            use = (
-                "never-fitted" if camera in drive.never_fitted else "held-out" if held else "fitted"
-            )
+            use = "held-out" if held[i] else usual
             ending = one.file.suffix.lower() if one.data is None else ".jpg"
             if one.lens.bends or (one.data is not None and bytes(one.data[:4]) == PNG[:4]):
                 ending = ".png"
-            out.append(
-                Shown(
-                    one,
-                    name,
-                    use,
-                    placed.poses[camera][i],
-                    f"photographs/{name}/{i:06d}{ending}",
-                )
-            )
+            file = f"photographs/{name}/{i:06d}{ending}"
+            out.append(Shown(one, name, use, placed.poses[camera][i], file))
     return out
 
 

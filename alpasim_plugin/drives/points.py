@@ -14,9 +14,16 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, left_of, transform_points
-from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
+from alpasim_plugin.core.geometry import (
+    interpolate,
+    inverse,
+    left_of,
+    trajectory_from_poses,
+    transform_points,
+)
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip
+from alpasim_plugin.drives.held_out import fitted_part
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, resized
@@ -311,37 +318,61 @@ FARTHEST_M, FARTHEST_RAD = (
 )  # of a correction; more is another fault than a recorder's noise
 
 
-def with_corrected_poses(drive: SourceDrive) -> SourceDrive:
-    """Return the drive with the front camera's poses adjusted to its photographs, and its other
-    cameras moved along, as a rig is rigid.
+def with_corrected_poses(drive: SourceDrive, every: int) -> SourceDrive:
+    """Return the drive with the front camera's poses adjusted to its photographs, and every other
+    photograph moved as the rig was at its time.
 
     Poses in metres are held to what they were; a drive that has points of its own keeps its poses.
+
+    Args:
+        drive: As its files say it.
+        every: One photograph of so many is held out, whose pixels say nothing.
     """
     if drive.metric is None or drive.points is not None or drive.kind == "colmap":
         return drive
-    front = drive.of(drive.front)
+    front = fitted_part(drive, every).of(drive.front)
     found = corrected([small_view(photograph, CORRECTING_PX) for photograph in front])
     if not found.after_px < LEAST_GAIN * found.before_px:  # also where there is nothing to say: NaN
         return drive
-    poses = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
-    moves = [new @ inverse(old.T_world_camera) for new, old in zip(poses, front, strict=True)]
-    turned = [np.arccos(np.clip((np.trace(move[:3, :3]) - 1) / 2, -1, 1)) for move in moves]
-    shifted = [
-        float(np.linalg.norm(new[:3, 3] - old.T_world_camera[:3, 3]))
-        for new, old in zip(poses, front, strict=True)
-    ]
-    if max(shifted) > FARTHEST_M or max(turned) > FARTHEST_RAD:
+    old = np.array([photograph.T_world_camera for photograph in front])
+    new = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
+    corrections = np.array([inverse(T) for T in old]) @ new  # in the camera's axes
+    traces = np.trace(corrections[:, :3, :3], axis1=1, axis2=2)
+    turned_rad = float(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max())
+    shifted_m = float(np.linalg.norm(corrections[:, :3, 3], axis=1).max())
+    if shifted_m > FARTHEST_M or turned_rad > FARTHEST_RAD:
         return drive
-    moved = {photograph.t_us: move for photograph, move in zip(front, moves, strict=True)}
-    photographs = tuple(
-        replace(
-            photograph,
-            T_world_camera=moved.get(photograph.t_us, np.eye(4)) @ photograph.T_world_camera,
-        )
-        for photograph in drive.photographs
-    )
     note = (
-        f"poses were corrected by the photographs, by up to {100 * max(shifted):.0f} cm and {np.degrees(max(turned)):.2f} degrees: "
+        f"poses were corrected by the photographs, by up to {100 * shifted_m:.0f} cm and {np.degrees(turned_rad):.2f} degrees: "
         f"points are met to {found.after_px:.2f} instead of {found.before_px:.2f} pixels"
     )
-    return replace(drive, photographs=photographs, notes=(*drive.notes, note))
+    times = np.array([int(photograph.t_us or 0) for photograph in front])
+    moved = moved_rig(drive, trajectory_from_poses(times, corrections))
+    return replace(moved, notes=(*drive.notes, note))
+
+
+def moved_rig(drive: SourceDrive, corrections: Trajectory) -> SourceDrive:
+    """Return the drive with its rig moved; a rig is rigid, so all its cameras move with the front
+    one.
+
+    Args:
+        drive: Its front camera's poses, with their times, are the rig's path.
+        corrections: The front camera's correction over time, in its own axes: from where it is
+            corrected to, to where it was. Between its times it is interpolated, beyond them it
+            stays as it is at its end.
+    """
+    front = drive.of(drive.front)
+    path = trajectory_from_poses(
+        [int(photograph.t_us or 0) for photograph in front],
+        [photograph.T_world_camera for photograph in front],
+    )
+    times = np.array([int(photograph.t_us or 0) for photograph in drive.photographs])
+    T_world_front = interpolate(path, times.clip(path.t_us[0], path.t_us[-1]))
+    corrected_at = interpolate(corrections, times.clip(corrections.t_us[0], corrections.t_us[-1]))
+    return replace(
+        drive,
+        photographs=tuple(
+            replace(photograph, T_world_camera=T @ C @ inverse(T) @ photograph.T_world_camera)
+            for photograph, T, C in zip(drive.photographs, T_world_front, corrected_at, strict=True)
+        ),
+    )

@@ -19,7 +19,7 @@ from alpasim_plugin.core.types import F32
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
-from alpasim_plugin.gaussians.fit.lens import gain_between
+from alpasim_plugin.gaussians.fit.lens import gain_near
 from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
@@ -47,17 +47,20 @@ def measure(
     """
     graph = model.graph()
     known = [view for view in views["fitted"] if view.name in exposures]
-    centres = np.array([view.camera.centre_world for view in known]).reshape(-1, 3)
-    gains = np.array([exposures[view.name] for view in known]).reshape(-1, 3)
+    cameras = [view.camera_name for view in known]
+    centres = np.array([view.camera.centre_world for view in known])
+    gains = np.array([exposures[view.name] for view in known])
+
+    def compared(view: PosedView) -> Comparison:
+        place = view.camera.centre_world
+        return _compared(graph, view, gain_near(view.camera_name, place, cameras, centres, gains))
+
     rows = {}
     for use in ("held-out", "never-fitted"):
         chosen = [views[use][i] for i in _spread(len(views[use]), 12)]
         if chosen:
             tell(f"measuring {use} photographs", 0, 1)
-            rows[use] = [
-                _compared(graph, view, gain_between(centres, gains, view.camera.centre_world))
-                for view in chosen
-            ]
+            rows[use] = [compared(view) for view in chosen]
     some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {
         lateral_m: float(np.mean([_covered(graph, view, lateral_m) for view in some]))

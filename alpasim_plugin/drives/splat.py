@@ -23,6 +23,7 @@ from alpasim_plugin.drives.build import (
     write_folder,
     write_photographs,
 )
+from alpasim_plugin.drives.held_out import EVERY, EVERY_STILL
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, check_motion, place
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
@@ -105,7 +106,8 @@ def import_splat(
         sky = Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))
         model = Reconstruction(placed_cloud(cloud, placed.T_world_source), {}, sky)
         begin(work, key)
-        shown = shown_photographs(drive, placed) if has_photographs else []
+        every = EVERY if placed.strip else EVERY_STILL
+        shown = shown_photographs(drive, placed, every) if has_photographs else []
         write_photographs(work, shown, tell)
         views = {
             use: [photograph.view() for photograph in shown if photograph.use == use]

@@ -21,6 +21,7 @@ from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.cache import cached
 from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.types import (
     F32,
     F64,
@@ -30,7 +31,7 @@ from alpasim_plugin.core.types import (
     RenderRequest,
     Scenario,
 )
-from alpasim_plugin.gaussians.fit.lens import gain_between
+from alpasim_plugin.gaussians.fit.lens import gain_near
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.log_views import SkyMask, SkyView
@@ -223,9 +224,12 @@ class ImportedRenderer(SplatRenderer):
 
 
 def exposure_near(fitted: Sequence[Photograph], camera: str, place: F64) -> F32:
-    """Return the gain ``(3,)`` at a place: of the two nearest fitted photographs of that camera, or
-    of all where it took none.
-    """
-    mine = [one for one in fitted if one.camera == camera] or fitted
-    centres = np.array([one.T_world_camera[:3, 3] for one in mine]).reshape(-1, 3)
-    return gain_between(centres, np.array([one.exposure for one in mine]).reshape(-1, 3), place)
+    """Return the gain ``(3,)`` at a place: see `gain_near`; the pinholes of a lens have its own."""
+    cameras = [one.camera for one in fitted]
+    return gain_near(
+        camera if camera in cameras else lens_camera(camera),
+        place,
+        cameras,
+        np.array([one.T_world_camera[:3, 3] for one in fitted]),
+        np.array([one.exposure for one in fitted]),
+    )

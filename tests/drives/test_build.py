@@ -13,6 +13,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.drives import build
 from alpasim_plugin.drives.build import import_drive
+from alpasim_plugin.drives.held_out import measured
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.source import Points
@@ -102,7 +103,9 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(w
     placed = place(
         replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     )
-    shown = build.shown_photographs(drive, placed)
+    assert placed.strip is None
+    _, _, every = measured(lambda every: (drive, placed))
+    shown = build.shown_photographs(drive, placed, every)
     assert sum(one.use == "held-out" for one in shown) == 5
     assert "photographs taken along a road" in str(placed.notes)
 

@@ -11,15 +11,16 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, Box
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
-from alpasim_plugin.gaussians.fit.lens import balances, gain_between
+from alpasim_plugin.gaussians.fit.lens import balances, gain_near
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start, start_from_maps, start_in_boxes
 from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place
-from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.fit.views import PosedView, camera_of
 
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
@@ -34,9 +35,9 @@ class FittedDrive:
 
     Attributes:
         model: Background, road users and sky, in the drive's own mean exposure.
-        exposures: Name of each view, fitted or kept, to the gains of red, green and blue over the
-            model's; a kept view's are those of its neighbours, because its own pixels are there to
-            judge.
+        exposures: Name of each photograph, fitted or kept, to the gains of red, green and blue over
+            the model's; a kept one's are those of its camera's nearest fitted ones, because its own
+            pixels are there to judge.
     """
 
     model: Reconstruction
@@ -47,7 +48,7 @@ def fit_drive(
     views: Sequence[PosedView],
     points: GaussianCloud | None,
     *,
-    kept: Sequence[PosedView] = (),
+    kept: Mapping[str, PinholeCamera] | None = None,
     boxes: Mapping[str, Box] | None = None,
     scene_id: str = "drive",
     folder: Path | None = None,
@@ -63,7 +64,8 @@ def fit_drive(
         views: To fit to, +z of the world up; names sort them along the way, and up to the last
             ``-`` they name the camera.
         points: Measured or triangulated points; None starts from what the views' own depth gives.
-        kept: Held out. The fit never sees their pixels; their gains are those of their neighbours.
+        kept: Names and cameras of the photographs that are held out. Their pixels are not passed;
+            their gains are those of their camera's nearest fitted photographs.
         boxes: Sizes of the road users that views show, which are fitted as nodes.
         scene_id: Key of the random streams.
         folder: Keeps the fit's state; the same call goes on from it.
@@ -84,10 +86,7 @@ def fit_drive(
             f"{scene_id}: no photograph", "give at least some ten photographs along the way"
         )
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
-    known = {view.name for view in views}
-    every, depths = prepared_views([*views, *kept], tell)
-    train = [view for view in every if view.name in known]
-    guesses = [depth for view, depth in zip(every, depths, strict=True) if view.name in known]
+    train, guesses = prepared_views(views, tell)
     seen = {name for view in train for name in view.actors}
     shown = {name: box for name, box in (boxes or {}).items() if name in seen}
     start = Start(
@@ -106,7 +105,7 @@ def fit_drive(
     )
     after = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
     exposures = {view.name: view.gain for view in after} | {
-        view.name: _between(after, view) for view in every if view.name not in known
+        name: _gain_near(after, name, camera) for name, camera in (kept or {}).items()
     }
     return FittedDrive(model, exposures)
 
@@ -212,12 +211,15 @@ def _start(
     )
 
 
-def _between(views: Sequence[PosedView], view: PosedView) -> tuple[float, float, float]:
-    """Return the gain of a view that was not fitted: that of its camera's nearest ones that
-    were.
-    """
-    mine = [other for other in views if other.camera_name == view.camera_name] or list(views)
-    centres = np.array([other.camera.centre_world for other in mine])
-    gains = np.array([other.gain for other in mine])
-    red, green, blue = gain_between(centres, gains, view.camera.centre_world)
-    return float(red), float(green), float(blue)
+def _gain_near(
+    views: Sequence[PosedView], name: str, camera: PinholeCamera
+) -> tuple[float, float, float]:
+    """Return the gain of a photograph that was not fitted."""
+    red, green, blue = gain_near(
+        camera_of(name),
+        camera.centre_world,
+        [view.camera_name for view in views],
+        np.array([view.camera.centre_world for view in views]),
+        np.array([view.gain for view in views]),
+    ).tolist()
+    return red, green, blue

@@ -151,16 +151,32 @@ def balances(views: Sequence[PosedView], tracks: Tracks) -> F64:
     return out
 
 
-def gain_between(centres: F64, gains: F64, place: F64) -> F32:
-    """Return the gain ``(3,)`` at a place, of the two nearest of ``centres (N, 3)``, by inverse
-    distance; 1 where there is none.
+def gain_near(camera: str, place: F64, cameras: Sequence[str], centres: F64, gains: F64) -> F32:
+    """Return the gain ``(3,)`` that a camera has at a place: of its two photographs that were taken
+    nearest, by inverse distance.
+
+    Cameras of a rig meter for themselves, so a photograph of another one says nothing, however near;
+    of a camera that took none, those of all cameras count. Without any the gain is 1.
+
+    Args:
+        camera: Whose gain.
+        place: ``(3,)`` metres, world.
+        cameras: Which camera took each photograph.
+        centres: ``(N, 3)`` metres, world: where they were taken.
+        gains: ``(N, 3)`` of their red, green and blue.
     """
+    centres = np.asarray(centres, np.float64).reshape(-1, 3)
+    gains = np.asarray(gains, np.float64).reshape(-1, 3)
     if not len(centres):
         return np.ones(3, np.float32)
+    is_own = np.array([name == camera for name in cameras])
+    if is_own.any():
+        centres = centres[is_own]
+        gains = gains[is_own]
     distance = np.linalg.norm(centres - place, axis=1)
-    near = np.argsort(distance, kind="stable")[:2]
-    weight = 1 / (distance[near] + 1e-3)
-    return np.asarray(weight @ gains[near] / weight.sum(), np.float32)
+    nearest = np.argsort(distance, kind="stable")[:2]
+    weight = 1 / (distance[nearest] + 1e-3)
+    return np.asarray(weight @ gains[nearest] / weight.sum(), np.float32)
 
 
 def _patch(rgb: U8, at: F64) -> F64:

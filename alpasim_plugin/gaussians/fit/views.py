@@ -44,7 +44,12 @@ class PosedView:
     @property
     def camera_name(self) -> str:
         """Return the name of the camera that took it."""
-        return self.name.rpartition("-")[0]
+        return camera_of(self.name)
+
+
+def camera_of(view: str) -> str:
+    """Return the name of the camera that took a view, by the view's name."""
+    return view.rpartition("-")[0]
 
 
 def logged_views(

@@ -36,7 +36,7 @@ def fitted(views):
         done = fit_drive(
             [*views[:4], *views[5:]],
             None,
-            kept=views[4:5],
+            kept={views[4].name: views[4].camera},
             scene_id="s",
             threads=1,
             recipe=QUICK,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
-from alpasim_plugin.gaussians.fit.lens import balances, gain_between
+from alpasim_plugin.gaussians.fit.lens import balances, gain_near
 from alpasim_plugin.gaussians.fit.tracks import Tracks, corrected, follow, place
 from alpasim_plugin.gaussians.fit.views import halved
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
@@ -130,12 +130,20 @@ def test_exposure_and_white_balance_are_found_to_a_percent(views, tracks):
     assert np.abs(np.log(found).mean(axis=0)).max() < 1e-9
 
 
-def test_a_gain_between_photographs_is_that_of_the_nearest_two():
-    centres = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]])
-    gains = np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3])
-    assert np.allclose(gain_between(centres, gains, np.array([0.5, 0, 0])), 1.1, atol=1e-3)
-    assert np.allclose(gain_between(centres, gains, np.zeros(3)), 1.0, atol=1e-3)
-    assert np.allclose(gain_between(centres[:0], gains[:0], np.zeros(3)), 1.0)
+def test_a_gain_between_photographs_is_that_of_the_nearest_two_of_the_own_camera():
+    cameras = ["front", "front", "front", "left"]
+    centres = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0], [0.5, 0, 0]])
+    gains = np.array([[1.0] * 3, [1.2] * 3, [5.0] * 3, [0.5] * 3])
+
+    def gain_at(camera, x_m, count=4):
+        place = np.array([x_m, 0.0, 0.0])
+        return gain_near(camera, place, cameras[:count], centres[:count], gains[:count])
+
+    assert np.allclose(gain_at("front", 0.5), 1.1, atol=1e-3)
+    assert np.allclose(gain_at("front", 0.0), 1.0, atol=2e-3)
+    assert np.allclose(gain_at("left", 8.0), 0.5)
+    assert np.allclose(gain_at("roof", 9.0, 3), 5.0, atol=2e-3)
+    assert np.allclose(gain_at("front", 0.0, 0), 1.0)
 
 
 def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views):
