@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from alpasim_plugin.cameras.lens import lens_camera
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.cache import cached
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.lens import lens_camera
 from alpasim_plugin.core.types import (
     F32,
     F64,
