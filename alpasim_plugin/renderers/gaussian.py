@@ -13,10 +13,11 @@ import numpy as np
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView, with_background
 from alpasim_plugin.renderers.background import read_background
+from alpasim_plugin.renderers.built_road import BuiltRoad
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.renderers.rolling import SplatRenderer
 from alpasim_plugin.streets.builder import build_scene
@@ -32,8 +33,12 @@ _cache: OrderedDict[str, object] = OrderedDict()
 class CleanRenderer(SplatRenderer):
     """Render the scene as built; its sky counts as opaque.
 
+    Of frames that stay on a device the first of each camera is looked at for a missing street, of
+    others every one: see `BuiltRoad`.
+
     Raises:
         InputError: Nothing was built: the scenario is an imported drive.
+        RendererError: A frame lacks the street.
     """
 
     def __init__(self, scenario: Scenario, seed: int, device: str, threads: int | None) -> None:
@@ -45,6 +50,19 @@ class CleanRenderer(SplatRenderer):
         self.scenario, self.seed, self.threads = scenario, seed, threads
         self.device = require_device(device)
         self.scene = scene_of(scenario)
+        background = scenario.background
+        self.road = None if background and not background.keep_road else BuiltRoad(scenario)
+        self._looked_at: set[str] = set()
+
+    def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Render the frames of an instant, and refuse one that lacks the street."""
+        frames = super().render_batch(requests)
+        for request, frame in zip(requests, frames, strict=True):
+            stays_there = frame.is_pending("depth") and request.camera.name in self._looked_at
+            if self.road is not None and not stays_there:
+                self.road.check(request, frame)
+                self._looked_at.add(request.camera.name)
+        return frames
 
     def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
         """Draw images; what is seen through the scene counts as opaque, and has no depth."""

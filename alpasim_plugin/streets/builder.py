@@ -1,17 +1,17 @@
 """Build a scene graph of Gaussians from a map, tracks and an environment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
 
 import numpy as np
 
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, Scenario
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.scene_graph import (
     Level,
+    NodeSet,
     SceneGraph,
     SceneNode,
 )
@@ -79,24 +79,36 @@ class LongScene(SceneGraph):
         self._height_at = height_at
         self._path = path_of(scenario)
         self._sections: dict[int, list[SceneNode]] = {}
+        self._sets: dict[tuple[int, ...], NodeSet] = {}
         self._lock = Lock()  # a server draws views of several drives at once
 
-    def render(
-        self,
-        camera: PinholeCamera,
-        actor_poses: Mapping[str, F64],
-        threads: int | None = None,
-        device: str = "cpu",
-        px_per_rad: float | None = None,
-    ) -> RasterOutput:
-        """Render one view; see `SceneGraph.render`."""
+    @property
+    def background(self) -> tuple[SceneNode, ...]:
+        """Return the nodes of the sections that are held now."""
+        return tuple(node for nodes in self._sections.values() for node in nodes)
+
+    def backgrounds(self, cameras: Sequence[PinholeCamera]) -> Sequence[NodeSet]:
+        """Build the sections that cameras may see, free the others, and return those of each."""
+        near = [self._near(camera) for camera in cameras]
+        needed = sorted(set().union(*near))
         with self._lock:
-            away_m = np.linalg.norm(self._path[:, :2] - camera.centre_world[:2], axis=1)
-            near = tuple(np.unique(section_of(np.flatnonzero(away_m < SIGHT_M))).tolist())
-            if near != tuple(self._sections):
-                self._sections = {i: self._sections.get(i) or self._built(i) for i in near}
-                self.set_background([node for i in near for node in self._sections[i]])
-            return super().render(camera, actor_poses, threads, device, px_per_rad)
+            if needed != list(self._sections):
+                self._sections = {
+                    i: self._sections[i] if i in self._sections else self._built(i) for i in needed
+                }
+                self._sets = {}
+            return [self._set_of(sections) for sections in near]
+
+    def _near(self, camera: PinholeCamera) -> tuple[int, ...]:
+        """Return the sections within sight of a camera; at least the nearest."""
+        away_m = np.linalg.norm(self._path[:, :2] - camera.centre_world[:2], axis=1)
+        points = np.flatnonzero(away_m <= max(SIGHT_M, float(away_m.min())))
+        return tuple(np.unique(section_of(points)).tolist())
+
+    def _set_of(self, sections: tuple[int, ...]) -> NodeSet:
+        if sections not in self._sets:
+            self._sets[sections] = NodeSet.of(node for i in sections for node in self._sections[i])
+        return self._sets[sections]
 
     def _built(self, section: int) -> list[SceneNode]:
         """Build a section; its nodes get names of their own."""

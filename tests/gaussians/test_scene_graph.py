@@ -11,10 +11,17 @@ from alpasim_plugin.gaussians.scene.scene_graph import (
     SceneGraph,
     SceneNode,
     in_view,
+    nodes_by_tile,
     split_by_tile,
 )
+from alpasim_plugin.streets.builder import LongScene
 from tests.examples import examples
 from tests.gaussians.graph_scenes import SKY, blobs, camera, node
+
+
+def choose(graph, view, poses, sharp=0):
+    (background,) = graph.backgrounds([view])
+    return graph._choose(view, poses, sharp, background)
 
 
 def joined(chosen):
@@ -30,7 +37,7 @@ def test_nodes_rendered_in_one_pass_equal_the_reference_of_their_joined_cloud():
     poses = {"car": se2(9.0, -0.5, 0.7, 1.2)}
     view = camera()
     fast = graph.render(view, poses)
-    slow = rasterize_reference(joined(graph._choose(view, poses, 0)), view, SKY.image(view))
+    slow = rasterize_reference(joined(choose(graph, view, poses)), view, SKY.image(view))
     assert np.abs(fast.rgb - slow.rgb).max() <= 1.5 / 255
     assert np.abs(fast.alpha - slow.alpha).max() < 5e-3
 
@@ -53,12 +60,12 @@ def test_node_out_of_view_is_not_drawn_and_does_not_change_the_image():
     both = SceneGraph([ahead, behind], [], SKY)
     one = SceneGraph([ahead], [], SKY)
     assert_array_equal(both.render(camera(), {}).rgb, one.render(camera(), {}).rgb)
-    assert [chosen.node for chosen in both._choose(camera(), {}, 0)] == [ahead]
+    assert [chosen.node for chosen in choose(both, camera(), {})] == [ahead]
 
 
 def test_node_beyond_its_far_limit_is_not_drawn():
     graph = SceneGraph([node("paint", blobs((60, 0, 1)), far_m=20.0)], [], SKY)
-    assert not graph._choose(camera(), {}, 0)
+    assert not choose(graph, camera(), {})
 
 
 @settings(deadline=None, max_examples=examples(200))
@@ -90,7 +97,7 @@ def test_farther_nodes_use_coarser_levels():
         Level(cell, blobs((0, 0, 0.5), n=n)) for cell, n in ((0.1, 64), (0.4, 16), (1.6, 4))
     )
     graph = SceneGraph([], [SceneNode("a", "actor", levels)], SKY)
-    chosen = [graph._choose(camera(), {"a": se2(x, 0, 0)}, 0) for x in (6.0, 20.0, 400.0)]
+    chosen = [choose(graph, camera(), {"a": se2(x, 0, 0)}) for x in (6.0, 20.0, 400.0)]
     assert [one.level for (one,) in chosen] == [0, 1, 2]
 
 
@@ -118,3 +125,22 @@ def test_same_sky_seen_while_turning_moves_across_the_image():
     assert_array_equal(
         SKY.image(camera(256, 96, se2(50, 9, 0.2))), b
     )  # and do not depend on where one stands
+
+
+def test_a_tile_with_only_the_finest_level_is_left_to_sharp_cameras():
+    """A kerb across a tile's border may have its middle in another tile at another size."""
+    cloud = blobs((8, 0, 1))
+    levels = [(0.05, cloud, np.zeros(40, np.int64)), (0.1, cloud, np.ones(40, np.int64))]
+    graph = SceneGraph(nodes_by_tile("kerb", levels, usual_cell_m=0.1), [], SKY)
+    names = [[one.node.name for one in choose(graph, camera(), {}, sharp)] for sharp in (0, 1)]
+    assert names == [["kerb/1"], ["kerb/0", "kerb/1"]]
+
+
+def test_a_scene_of_no_kind_draws_in_a_way_of_its_own():
+    """What a subclass does beside `backgrounds` would be left out by callers of the other method."""
+    kinds = [SceneGraph]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    for kind in kinds[1:]:
+        assert not {"render", "render_all", "_choose"} & set(vars(kind)), kind
+    assert LongScene in kinds

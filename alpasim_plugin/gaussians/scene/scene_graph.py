@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, final
 
 import numpy as np
 
@@ -50,6 +50,11 @@ class Level:
 
     cell_m: float
     cloud: GaussianCloud
+
+    @cached_property
+    def prepared(self) -> PreparedCloud:
+        """Return the Gaussians as the CPU's rasteriser takes them, kept as long as the level is."""
+        return prepare(self.cloud)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +95,8 @@ class SceneNode:
 
 def split_by_tile(cloud: GaussianCloud, tile: I64) -> dict[int, GaussianCloud]:
     """Return the Gaussians of each tile; ``tile (N,)`` names the tile of each Gaussian."""
+    if not len(tile):
+        return {}
     order = np.argsort(tile, kind="stable")
     ids, first = np.unique(tile[order], return_index=True)
     ordered = cloud.take(order)
@@ -118,8 +125,9 @@ def nodes_by_tile(
 
     Args:
         prefix: Start of the nodes' names.
-        levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack its finest
-            levels, not its coarser ones.
+        levels: (cell size, cloud, tile of each Gaussian), finest first. A tile may lack some: what
+            lies across a border may have its middle in one tile at one size and in the next at
+            another.
         far_m, usual_cell_m: See `SceneNode`.
     """
     by_tile: dict[int, list[Level]] = {}
@@ -146,8 +154,34 @@ class ChosenNode(NamedTuple):
     antialiased: bool
 
 
+@dataclass(frozen=True, eq=False)
+class NodeSet:
+    """Nodes in world coordinates, with what they are culled by.
+
+    Attributes:
+        nodes: In the order of drawing at equal depth.
+        centre, radius: ``(N, 3)``, ``(N,)`` metres, world: their spheres.
+        far_m: ``(N,)`` metres: beyond this distance they are not drawn.
+    """
+
+    nodes: tuple[SceneNode, ...]
+    centre: F64
+    radius: F64
+    far_m: F64
+
+    @classmethod
+    def of(cls, nodes: Iterable[SceneNode]) -> NodeSet:
+        """Return the set of nodes."""
+        chosen = tuple(nodes)
+        centre, radius = _spheres(chosen)
+        return cls(chosen, centre, radius, np.array([node.far_m for node in chosen]))
+
+
 class SceneGraph:
     """A scene ready to be rendered from anywhere.
+
+    Every kind of scene is drawn by `render_all`, which nothing overrides. What is not held as a
+    whole overrides `backgrounds`.
 
     Args:
         background: Nodes in world coordinates.
@@ -163,22 +197,23 @@ class SceneGraph:
     ) -> None:
         self.actors = {node.name: node for node in sorted(actors, key=lambda node: node.name)}
         self.sky = sky
-        self._prepared: dict[tuple[str, int], PreparedCloud] = {}
-        self.set_background(background)
+        self._whole = NodeSet.of(background)
+        self._uploaded: dict[str, _OnDevice] = {}
 
-    def set_background(self, background: Sequence[SceneNode]) -> None:
-        """Replace the background; what was kept for nodes that are no longer in it is freed."""
-        self.background = tuple(background)
-        self._centre, self._radius = _spheres(self.background)
-        self._far = np.array([node.far_m for node in self.background])
-        names = {node.name for node in self.background} | set(self.actors)
-        self._prepared = {key: kept for key, kept in self._prepared.items() if key[0] in names}
-        self._uploaded: dict[str, tuple[UploadedClouds, dict[tuple[str, int], int]]] = {}
+    @property
+    def background(self) -> tuple[SceneNode, ...]:
+        """Return the background nodes that are held now."""
+        return self._whole.nodes
+
+    def backgrounds(self, cameras: Sequence[PinholeCamera]) -> Sequence[NodeSet]:
+        """Return for each camera the background that it may see."""
+        return [self._whole] * len(cameras)
 
     def __len__(self) -> int:
         """Return the number of Gaussians at the finest level."""
         return sum(len(node.levels[0].cloud) for node in (*self.background, *self.actors.values()))
 
+    @final
     def render(
         self,
         camera: PinholeCamera,
@@ -190,6 +225,7 @@ class SceneGraph:
         """Render one view; see `render_all`."""
         return self.render_all([(camera, actor_poses)], threads, device, px_per_rad)[0]
 
+    @final
     def render_all(
         self,
         views: Sequence[SceneView],
@@ -212,12 +248,14 @@ class SceneGraph:
         Raises:
             RendererError: A pose for an actor that the scene does not hold.
         """
+        backgrounds = self.backgrounds([camera for camera, _ in views])
         chosen = [
-            (camera, self._choose(camera, poses, halvings_of(px_per_rad or camera.fx)))
-            for camera, poses in views
+            (camera, self._choose(camera, poses, halvings_of(px_per_rad or camera.fx), background))
+            for (camera, poses), background in zip(views, backgrounds, strict=True)
         ]
+        held = dict.fromkeys(node for background in backgrounds for node in background.nodes)
         one_by_one = partial(map, partial(self._draw_on_host, threads))
-        on_card = partial(self._draw_on_card, device)
+        on_card = partial(self._draw_on_card, device, tuple(held))
         draw: Callable[..., Iterable[RasterOutput]] = implementation(device, one_by_one, on_card)
         return list(draw(chosen))
 
@@ -227,7 +265,7 @@ class SceneGraph:
         camera, chosen = view
         nodes: list[Node] = []
         for one in chosen:
-            prepared = self._prepare(one.node, one.level)
+            prepared = one.node.levels[one.level].prepared
             if one.antialiased:
                 prepared = replace(prepared, antialias_px2=MIP_PX2)
             nodes.append((prepared, one.T_world_node))
@@ -238,11 +276,14 @@ class SceneGraph:
         return rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
 
     def _draw_on_card(
-        self, device: str, views: Sequence[tuple[PinholeCamera, Sequence[ChosenNode]]]
+        self,
+        device: str,
+        held: tuple[SceneNode, ...],
+        views: Sequence[tuple[PinholeCamera, Sequence[ChosenNode]]],
     ) -> list[DeviceOutput]:
         from alpasim_plugin.gaussians.raster.rasterize_triton import CloudView, DrawnCloud
 
-        clouds, place = self._upload(device)
+        _, clouds, place = self._upload(device, held)
         placed = [
             (
                 camera,
@@ -260,7 +301,11 @@ class SceneGraph:
         return batched(placed, lambda view: (view[0].height, view[0].width), draw)
 
     def _choose(
-        self, camera: PinholeCamera, actor_poses: Mapping[str, F64], sharp: int
+        self,
+        camera: PinholeCamera,
+        actor_poses: Mapping[str, F64],
+        sharp: int,
+        background: NodeSet,
     ) -> list[ChosenNode]:
         if camera.rolling is not None:
             camera = camera.widened(camera.rolling.reach_px)
@@ -274,51 +319,63 @@ class SceneGraph:
         poses = np.array([actor_poses[node.name] for node in present]).reshape(-1, 4, 4)
         centre, radius = _spheres(present)
         moved = np.einsum("nij,nj->ni", poses[:, :3, :3], centre) + poses[:, :3, 3]
-        centres = np.concatenate([self._centre, moved])
-        radii = np.concatenate([self._radius, radius])
+        centres = np.concatenate([background.centre, moved])
+        radii = np.concatenate([background.radius, radius])
         distance = np.linalg.norm(centres - camera.centre_world, axis=1) - radii
         seen = in_view(camera, centres, radii)
-        seen[: len(self._far)] &= distance[: len(self._far)] < self._far
-        nodes = (*self.background, *present)
-        places = [None] * len(self.background) + list(poses)
+        count = len(background.nodes)
+        seen[:count] &= distance[:count] < background.far_m
+        nodes = (*background.nodes, *present)
+        places = [None] * count + list(poses)
         allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
-        return [
-            ChosenNode(
-                nodes[i],
-                self._level(nodes[i], float(allowed_m[i]), sharp),
-                places[i],
-                sharp > 0 and nodes[i].is_built,
-            )
-            for i in np.flatnonzero(seen)
-        ]
+        chosen = []
+        for i in np.flatnonzero(seen):
+            level = _level(nodes[i], float(allowed_m[i]), sharp)
+            if level is not None:
+                antialiased = sharp > 0 and nodes[i].is_built
+                chosen.append(ChosenNode(nodes[i], level, places[i], antialiased))
+        return chosen
 
-    def _level(self, node: SceneNode, allowed_m: float, sharp: int) -> int:
-        """Return the coarsest level whose cells are small enough for a camera, else its finest."""
-        least_m = node.usual_cell_m / 2**sharp
-        most_m = allowed_m / 2 if sharp and node.is_built else allowed_m
-        own = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
-        fit = [i for i in own if node.levels[i].cell_m <= most_m]
-        return fit[-1] if fit else own[0]
-
-    def _prepare(self, node: SceneNode, level: int) -> PreparedCloud:
-        key = (node.name, level)
-        if key not in self._prepared:
-            self._prepared[key] = prepare(node.levels[level].cloud)
-        return self._prepared[key]
-
-    def _upload(self, device: str) -> tuple[UploadedClouds, dict[tuple[str, int], int]]:
-        """Return all levels of all nodes on a device, and the place of each by name and level."""
-        if device not in self._uploaded:
+    def _upload(self, device: str, held: tuple[SceneNode, ...]) -> _OnDevice:
+        """Return all levels of the background and of the actors on a device; what was there is
+        kept if the background is the same.
+        """
+        kept = self._uploaded.get(device)
+        if kept is None or kept.background != held:
             from alpasim_plugin.gaussians.raster.rasterize_triton import UploadedClouds
 
             clouds = {
                 (node.name, i): level.cloud
-                for node in (*self.background, *self.actors.values())
+                for node in (*held, *self.actors.values())
                 for i, level in enumerate(node.levels)
             }
             place = {key: number for number, key in enumerate(clouds)}
-            self._uploaded[device] = UploadedClouds(list(clouds.values()), device), place
-        return self._uploaded[device]
+            kept = _OnDevice(held, UploadedClouds(list(clouds.values()), device), place)
+            self._uploaded[device] = kept
+        return kept
+
+
+class _OnDevice(NamedTuple):
+    """What lies on a device: the clouds of a background and of all actors, and the place of each
+    by the node's name and the level.
+    """
+
+    background: tuple[SceneNode, ...]
+    clouds: UploadedClouds
+    place: Mapping[tuple[str, int], int]
+
+
+def _level(node: SceneNode, allowed_m: float, sharp: int) -> int | None:
+    """Return the coarsest level whose cells are small enough for a camera, else the finest of those
+    that the camera may use; None for a node that only sharper cameras see.
+    """
+    least_m = node.usual_cell_m / 2**sharp
+    most_m = allowed_m / 2 if sharp and node.is_built else allowed_m
+    own = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
+    fit = [i for i in own if node.levels[i].cell_m <= most_m]
+    if fit:
+        return fit[-1]
+    return own[0] if own else None
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:

@@ -1,0 +1,69 @@
+"""Recognise a frame that lacks the street: the road below the drive's path is always built, so where
+it projects into a view there is a surface, the road or what hides it.
+"""
+
+import numpy as np
+
+from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.types import F32, I64, Frame, RenderRequest, Scenario
+from alpasim_plugin.streets.site import path_of
+from alpasim_plugin.world.ground import height_at
+
+# Along the optical axis: nearer is the ego's own place, farther is thinner than a pixel.
+NEAREST_M, FARTHEST_M = 3.0, 40.0
+# So many points judge a view, the nearest, which a road user ahead does not hide; this share of them
+# must show a surface.
+JUDGES, LEAST_SHARE = 8, 0.25
+ABOVE_M = 0.3  # of a camera over the road: from below, or in it, nothing of it is seen
+
+
+class BuiltRoad:
+    """Points of the road that is built below a scenario's path, a metre apart."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.ground = scenario.ground
+        self.points = path_of(scenario).copy()
+        self.points[:, 2] = height_at(scenario.ground, self.points)
+
+    def check(self, request: RenderRequest, frame: Frame) -> None:
+        """Refuse a frame without surfaces where the road is in view.
+
+        Args:
+            request: Of a camera that sees straight lines as straight.
+            frame: What was rendered; its depth is 0 where it shows no surface.
+
+        Raises:
+            RendererError: The road projects into the view, and the frame shows no surface there.
+        """
+        pixels = self._in_view(request)[:JUDGES]
+        depth = frame.depth
+        if len(pixels) < JUDGES or depth is None:
+            return
+        share = float((depth[pixels[:, 1], pixels[:, 0]] > 0).mean())
+        if share < LEAST_SHARE:
+            raise RendererError(
+                f"camera {request.camera.name!r} at {request.t_us} us: the built road lies in the view, and the frame shows a surface at {100 * share:.0f} % of its {JUDGES} nearest points",
+                "this is a fault of the renderer: report it with the scenario",
+            )
+
+    def _in_view(self, request: RenderRequest) -> I64:
+        """Return the pixels ``(N, 2)``, column and row, of the points that a camera looks at, the
+        nearest first.
+        """
+        camera = request.camera
+        T_world_camera = request.T_world_camera[1]
+        place = T_world_camera[:3, 3]
+        if place[2] < height_at(self.ground, place[None])[0] + ABOVE_M:
+            return np.zeros((0, 2), np.int64)
+        local = (self.points - place) @ T_world_camera[:3, :3]
+        local = local[(local[:, 2] > NEAREST_M) & (local[:, 2] < FARTHEST_M)]
+        local = local[np.argsort(local[:, 2], kind="stable")]
+        projected = local @ camera.K.T
+        pixels = np.floor(projected[:, :2] / projected[:, 2:]).astype(np.int64)
+        is_inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        pixels = pixels[is_inside]
+        if request.exposure is not None:
+            share: F32 = np.broadcast_to(request.exposure.share, (camera.height, camera.width))
+            # What nobody looks at is not rendered.
+            pixels = pixels[np.isfinite(share[pixels[:, 1], pixels[:, 0]])]
+        return pixels
