@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from alpasim_plugin.cameras.lens import lens_camera
+from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.cache import cached
@@ -52,7 +53,7 @@ from alpasim_plugin.renderers.reconstruction_key import (
     reconstruction_key,
 )
 from alpasim_plugin.renderers.recorded import built_recording, photograph_recording
-from alpasim_plugin.renderers.rolling import SplatRenderer
+from alpasim_plugin.renderers.rolling import SplatRenderer, camera_at
 from alpasim_plugin.streets.build_actors import build_actor
 from alpasim_plugin.streets.builder import finished
 
@@ -81,12 +82,19 @@ class ReconstructionRenderer(SplatRenderer):
         self.model = model_of(scenario, self.recipe, threads, device)
 
     def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
-        """Draw images; the sky counts as opaque where the views of the fit showed it."""
+        """Draw images with depth where they show surfaces."""
         outs = self.model.graph.render_all(views, self.threads, self.device)
-        return [
-            out.surface().covered(self.model.sky.share(camera))
-            for out, (camera, _) in zip(outs, views, strict=True)
-        ]
+        return [out.surface() for out in outs]
+
+    def developed(self, request: RenderRequest, out: RasterOutput) -> RasterOutput:
+        """Return the image with the sky opaque where the views of the fit showed it; of a rolling
+        shutter as at its middle.
+        """
+        T_world_camera = request.T_world_camera[1]
+        if request.exposure is not None:
+            T_world_camera, _ = at_share(request, 0.5)
+        camera = camera_at(request, T_world_camera)
+        return out.covered(self.model.sky.share(camera, request.camera.name))
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return what the scenario's cameras saw along the log, at the believed poses; the drives

@@ -77,7 +77,11 @@ def build(
     actors = {
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
     }
-    sky_views = [SkyView(v.camera, v.sky.astype(np.float32)) for v in believed if v.sky is not None]
+    sky_views = [
+        SkyView(view.camera, view.sky.astype(np.float32), view.camera_name)
+        for view in believed
+        if view.sky is not None
+    ]
     facts = {"scene_id": scene_id, "recipe": asdict(recipe), "views": len(views)}
     write_model(folder, Reconstruction(fitted.background, actors, fitted.sky), sky_views, facts)
 

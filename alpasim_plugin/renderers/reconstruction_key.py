@@ -251,6 +251,7 @@ def write_model(
         K=np.array([v.camera.K for v in sky_views]).reshape(-1, 3, 3),
         T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
         sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
+        name=np.array([view.name for view in sky_views], dtype=np.str_),
     )
 
 
@@ -267,14 +268,15 @@ def read_model(folder: Path) -> tuple[Reconstruction, list[SkyView]]:
 
 
 def _read_sky_views(path: Path) -> list[SkyView]:
-    sizes, Ks, Ts, bits = read_npz(path, ("size", "K", "T_camera_world", "sky"), DO_THIS)
+    fields = ("size", "K", "T_camera_world", "sky", "name")
+    sizes, Ks, Ts, bits, names = read_npz(path, fields, DO_THIS)
     views = []
     first = 0
-    for (width, height), K, T in zip(sizes.tolist(), Ks, Ts, strict=True):
+    for (width, height), K, T, name in zip(sizes.tolist(), Ks, Ts, names.tolist(), strict=True):
         length = -(-width * height // 8)
         sky = np.unpackbits(bits[first : first + length], count=width * height).reshape(
             height, width
         )
-        views.append(SkyView(PinholeCamera(width, height, K, T), sky.astype(np.float32)))
+        views.append(SkyView(PinholeCamera(width, height, K, T), sky.astype(np.float32), name))
         first += length
     return views

@@ -20,9 +20,9 @@ def camera(width, height, yaw_rad=0.0, x_m=0.0):
     return PinholeCamera.from_pose(width, height, K, se2(x_m, 0, yaw_rad) @ T_rig_camera)
 
 
-def view(alpha, **pose):
+def view(alpha, name="", **pose):
     sky = (alpha <= 0.5).astype(np.float32)
-    return SkyView(camera(alpha.shape[1], alpha.shape[0], **pose), sky)
+    return SkyView(camera(alpha.shape[1], alpha.shape[0], **pose), sky, name)
 
 
 def test_same_pose_at_twice_the_size_repeats_what_the_view_saw():
@@ -40,6 +40,48 @@ def test_turning_left_moves_the_skyline_to_the_right():
     columns = share[9] > 0.5
     assert np.flatnonzero(columns)[0] in (19, 20, 21)  # 4 columns on, as the focal length says
     assert columns[21:].all()
+
+
+def test_what_no_view_saw_is_no_sky():
+    clear = np.zeros((18, 32), np.float32)
+    turned = camera(32, 18, yaw_rad=np.arctan(4 / 32))
+    share = SkyMask([view(clear)]).share(turned)
+    assert share[9, :3].max() == 0.0  # to the left of the view's border
+    assert share[9, 5:].min() == 1.0
+    assert SkyMask([view(clear)]).share(camera(32, 18, yaw_rad=np.pi)).max() == 0.0
+
+
+def test_a_view_of_the_own_camera_comes_before_a_nearer_one_of_another():
+    """A metre to the side of the path a neighbouring camera's eye is nearer than the own one's."""
+    clear = np.zeros((18, 32), np.float32)
+    hidden = np.ones((18, 32), np.float32)
+    mask = SkyMask(
+        [
+            view(clear, "front", x_m=0.0),
+            view(hidden, "front", x_m=9.0),
+            view(hidden, "left", x_m=1.0, yaw_rad=0.6),
+        ]
+    )
+    assert mask.share(camera(32, 18, x_m=1.0), "front").min() == 1.0
+    assert mask.share(camera(32, 18, x_m=8.0), "front").max() == 0.0
+
+
+def test_another_camera_of_the_rig_completes_what_the_own_one_did_not_see():
+    clear = np.zeros((18, 32), np.float32)
+    hidden = np.ones((18, 32), np.float32)
+    hidden[:, 16:] = 0.0
+    mask = SkyMask([view(hidden, "front"), view(clear, "left", yaw_rad=0.5)])
+    share = mask.share(camera(32, 18, yaw_rad=np.arctan(4 / 32)), "front")
+    assert share[9, :3].min() == 1.0  # what only the left camera saw
+    assert share[9, 6:18].max() == 0.0  # what the front camera saw to be a wall
+    assert share[9, 22:].min() == 1.0
+
+
+def test_a_camera_without_a_view_of_its_name_takes_the_nearest_that_shows_its_image():
+    clear = np.zeros((18, 32), np.float32)
+    hidden = np.ones((18, 32), np.float32)
+    mask = SkyMask([view(clear, "front"), view(hidden, "left", x_m=0.9, yaw_rad=0.9)])
+    assert mask.share(camera(32, 18, x_m=1.0), "camera_front_wide_120fov").min() == 1.0
 
 
 def test_nearest_view_that_looks_the_same_way_is_taken():

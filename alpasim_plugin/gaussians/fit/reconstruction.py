@@ -133,7 +133,8 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
             camera = view.camera
             local = camera.unprojected(rows, columns, np.ones(len(rows)))
             x, y, z = (local @ camera.T_camera_world[:3, :3]).T
-            column = np.floor(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
+            # A pixel of the panorama has its middle at a whole number, in rows and in columns.
+            column = np.rint(np.arctan2(y, x) * (WIDTH / (2 * np.pi))).astype(np.int64) % WIDTH
             below = HIGH_RAD - np.arctan2(z, np.hypot(x, y))
             row = np.rint(below * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))).astype(np.int64)
             row = row.clip(0, HEIGHT - 1)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse
-from alpasim_plugin.core.types import F32, F64, Actor, Scenario
+from alpasim_plugin.core.geometry import interpolate, intrinsics
+from alpasim_plugin.core.types import F32, F64, Actor, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 
 
@@ -34,14 +34,23 @@ def actors_at(actors: Iterable[Actor], t_us: int) -> dict[str, F64]:
 
 @dataclass(frozen=True, eq=False)
 class SkyView:
-    """Where one logged camera saw sky: ``sky (H, W)`` float32, 1 where it did."""
+    """Where one logged camera saw sky: ``sky (H, W)`` float32, 1 where it did; and its name."""
 
     camera: PinholeCamera
     sky: F32
+    name: str = ""
+
+
+# Of a view that others are asked to complete: the share of the image that it must show. How many
+# views complete it, and how many directions along each side of the image say what a view shows.
+LEAST_COVER, MOST_VIEWS, DIRECTIONS = 0.5, 8, 5
 
 
 class SkyMask:
-    """Sky mask from the nearest log view of a similar direction.
+    """Sky mask from what the log's views saw of the directions of a camera.
+
+    The nearest view of the same camera comes first, then those of others; a view answers for the
+    directions that it saw, and the next for what is left. A direction that none saw is no sky.
 
     Args:
         views: Of cameras that may look in different directions; without any, nothing is sky.
@@ -49,36 +58,88 @@ class SkyMask:
 
     def __init__(self, views: Sequence[SkyView]) -> None:
         self._views = tuple(views)
-        T = np.array([inverse(view.camera.T_camera_world) for view in views]).reshape(-1, 4, 4)
-        self._axes, self._eyes = T[:, :3, 2], T[:, :3, 3]  # (V, 3) world
+        T = np.array([view.camera.T_camera_world for view in views]).reshape(-1, 4, 4)
+        self._R = T[:, :3, :3]  # (V, 3, 3) world to view
+        self._eyes = -np.einsum("vji,vj->vi", self._R, T[:, :3, 3])  # (V, 3) world
+        self._K = np.array([view.camera.K for view in views]).reshape(-1, 3, 3)
+        sizes = [[view.camera.width, view.camera.height] for view in views]
+        self._sizes = np.array(sizes, np.float64).reshape(-1, 2)
+        self._names = np.array([view.name for view in views])
 
-    def share(self, camera: PinholeCamera) -> F32:
-        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1; beyond the view's border its
-        outermost pixels go on.
+    def share(self, camera: PinholeCamera, name: str = "") -> F32:
+        """Return how much of every pixel ``(H, W)`` is sky, 0 to 1.
+
+        Args:
+            camera: From where.
+            name: Of the camera among those of the views; without it all count alike.
         """
-        if not self._views:
-            return np.zeros((camera.height, camera.width), np.float32)
-        T = inverse(camera.T_camera_world)
-        R = T[:3, :3]
-        eye = T[:3, 3]
-        turned_away = self._axes @ R[:, 2] < 0.5
-        nearest = int(np.argmin(np.linalg.norm(self._eyes - eye, axis=1) + 1e6 * turned_away))
-        view = self._views[nearest]
-        # The warp counts from pixel centres, cameras from the corner.
-        half = intrinsics(1.0, 1.0, 0.5, 0.5)
-        to_view = (
-            np.linalg.inv(half)
-            @ view.camera.K
-            @ view.camera.T_camera_world[:3, :3]
-            @ R
-            @ np.linalg.inv(camera.K)
-            @ half
+        share = np.zeros((camera.height, camera.width), np.float32)
+        is_open = np.ones(share.shape, np.bool_)
+        for i in self._in_order(camera, name)[:MOST_VIEWS]:
+            sky, is_seen = _carried(self._views[i], camera)
+            taken = is_open & is_seen
+            share[taken] = sky[taken]
+            is_open &= ~is_seen
+            if not is_open.any():
+                break
+        return share
+
+    def _in_order(self, camera: PinholeCamera, name: str) -> list[int]:
+        """Return the numbers of the views that show any of an image, the first to be asked first:
+        those that show enough of it, of its own camera and near; then those that show more.
+        """
+        cover = self._cover(camera)
+        away_m = np.linalg.norm(self._eyes - camera.centre_world, axis=1)
+        is_other = self._names != name if name in self._names else np.zeros(len(cover), np.bool_)
+        lacking = np.where(cover < LEAST_COVER, 1 - cover, 0.0)
+        order = np.lexsort((away_m, is_other, lacking))
+        return [int(i) for i in order if cover[i] > 0]
+
+    def _cover(self, camera: PinholeCamera) -> F64:
+        """Return what share of an image's directions lies in each view, ``(V,)``."""
+        x, y = np.meshgrid(
+            np.linspace(0, camera.width, DIRECTIONS), np.linspace(0, camera.height, DIRECTIONS)
         )
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpPerspective(
-            view.sky,
-            to_view,
-            (camera.width, camera.height),
-            flags=flags,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])  # (3, N)
+        rays = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K) @ pixels
+        projected = self._K @ (self._R @ rays)  # (V, 3, N)
+        depth = projected[:, 2]
+        places = projected[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
+        # A camera turned by rounding alone sees its own border.
+        inside = (places > -1e-6) & (places < self._sizes[..., None] + 1e-6)
+        return np.asarray((inside.all(axis=1) & (depth > 0)).mean(axis=1), np.float64)
+
+
+def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
+    """Return where a view's sky lies in another camera's image ``(H, W)``, and which of its pixels
+    the view saw.
+    """
+    # The warp counts from pixel centres, cameras from the corner.
+    half = intrinsics(1.0, 1.0, 0.5, 0.5)
+    to_view = (
+        np.linalg.inv(half)
+        @ view.camera.K
+        @ view.camera.T_camera_world[:3, :3]
+        @ camera.T_camera_world[:3, :3].T
+        @ np.linalg.inv(camera.K)
+        @ half
+    )
+    size = (camera.width, camera.height)
+    interpolated = cv2.warpPerspective(
+        view.sky,
+        to_view,
+        size,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    is_inside = cv2.warpPerspective(
+        np.ones(view.sky.shape, np.uint8),
+        to_view,
+        size,
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+    )
+    columns = np.arange(camera.width)
+    rows = np.arange(camera.height)[:, None]
+    depth = to_view[2, 0] * columns + to_view[2, 1] * rows + to_view[2, 2]
+    return interpolated, (is_inside > 0) & (depth > 0)
