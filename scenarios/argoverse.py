@@ -408,7 +408,7 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
         fx, fy, cx, cy = (float(inner[k][i]) for k in ("fx_px", "fy_px", "cx_px", "cy_px"))
         T_rig_camera = mounts[name].copy()
         T_rig_camera[2, 3] += WHEEL_RADIUS_M  # the rig's origin is on the ground
-        K = intrinsics(fx, fy, cx, cy)
+        K = intrinsics(fx, fy, cx + 0.5, cy + 0.5)  # Argoverse counts from pixel centres
         k1, k2, k3 = (float(inner[k][i]) for k in ("k1", "k2", "k3"))
         lens = LensModel("opencv", (k1, k2, 0.0, 0.0, k3))
         size = int(inner["width_px"][i]), int(inner["height_px"][i])

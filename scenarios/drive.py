@@ -28,7 +28,9 @@ from alpasim_plugin.core.types import (
     HeightField,
     Lane,
     LaneMap,
+    Marking,
     Photograph,
+    Signal,
     Trajectory,
     Vehicle,
 )
@@ -40,6 +42,8 @@ GROUND_FILE = "ground.npy"
 MODEL_FOLDER = "model"
 DO_THIS = "import the drive again: simrun import drive FOLDER -o OUT"
 LINES = ("road_edges", "crosswalks", "stop_lines")
+MORE_LINES = ("drivable_areas", "poles")  # that older imports left out, with all below
+SIGNALS = ("signals", "give_way")
 
 
 @dataclass(frozen=True)
@@ -100,13 +104,7 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
             }
             for camera in log.cameras
         ],
-        "map": {
-            "lanes": [
-                {name: _plain(value) for name, value in vars(lane).items()}
-                for lane in lane_map.lanes.values()
-            ],
-            **{name: [line.tolist() for line in getattr(lane_map, name)] for name in LINES},
-        },
+        "map": _map_document(lane_map),
         "ground": {"x0_m": log.ground.x0_m, "y0_m": log.ground.y0_m, "cell_m": log.ground.cell_m},
         "obstacles": [
             {
@@ -122,6 +120,29 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
         "notes": list(log.notes),
     }
     write_json(folder / DRIVE_FILE, document)
+
+
+def _map_document(lane_map: LaneMap) -> JsonObject:
+    lines = {
+        name: [line.tolist() for line in getattr(lane_map, name)] for name in (*LINES, *MORE_LINES)
+    }
+    signals = {
+        name: None if (some := getattr(lane_map, name)) is None else [_record(one) for one in some]
+        for name in SIGNALS
+    }
+    return {
+        "lanes": [_record(lane) for lane in lane_map.lanes.values()],
+        **lines,
+        "markings": [_record(one) for one in lane_map.markings],
+        "signs": [
+            {"T_world_sign": pose.tolist(), "box": vars(box)} for pose, box in lane_map.signs
+        ],
+        **signals,
+    }
+
+
+def _record(one: Lane | Marking | Signal) -> JsonObject:
+    return {name: _plain(value) for name, value in vars(one).items()}
 
 
 def _track(track: Trajectory) -> JsonObject:
@@ -202,7 +223,34 @@ def _map_of(document: JsonObject) -> LaneMap:
         lane = Lane(**{**fields, **edges, "successors": tuple(fields["successors"])})
         lanes[lane.lane_id] = lane
     lines: dict[str, Any] = {name: tuple(map(_rows, document[name])) for name in LINES}
-    return LaneMap(lanes, **lines)
+    lines |= {name: tuple(map(_rows, document.get(name, ()))) for name in MORE_LINES}
+    signals = document.get("signals")
+    return LaneMap(
+        lanes,
+        markings=tuple(
+            Marking(_rows(one["xyz"]), one["mark_type"]) for one in document.get("markings", ())
+        ),
+        signs=tuple(
+            (_rows(one["T_world_sign"], 4), Box(**one["box"])) for one in document.get("signs", ())
+        ),
+        signals=None if signals is None else tuple(map(_signal, signals)),
+        give_way=tuple(map(_signal, document.get("give_way", ()))),
+        **lines,
+    )
+
+
+def _signal(fields: JsonObject) -> Signal:
+    head = fields["head"]
+    phases = tuple((colour, lasts_us) for colour, lasts_us in fields["phases"])
+    return Signal(
+        **{
+            **fields,
+            "stop": _rows(fields["stop"]),
+            "phases": phases,
+            "lanes": tuple(fields["lanes"]),
+            "head": None if head is None else np.array(head, np.float64),
+        }
+    )
 
 
 def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightField:

@@ -69,11 +69,10 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
         if not (sensor.get("properties") or {}).get("Model"):
             continue  # a radar or a lidar
         with parsing(f"{path}, {name}", GIVE):
-            (cx, cy, width, height), polynomial, goes_back = _lens_numbers(sensor["properties"])
+            cx, cy, width, height = _lens_numbers(sensor["properties"])[0]
+            lens = sensor_lens(sensor["properties"])
             T_rig_camera = orthonormal(mount(sensor))
-            given = (*polynomial, *[0.0] * (6 - len(polynomial)))
-            focal = 1 / given[1] if goes_back else given[1]
-        lens = LensModel("ftheta", () if goes_back else given, given if goes_back else ())
+            focal = 1 / lens.pixel_to_angle[1] if lens.pixel_to_angle else lens.coefficients[1]
         K = intrinsics(focal, focal, cx, cy)
         cameras.append(CameraSpec(name, int(width), int(height), K, T_rig_camera, lens=lens))
     if not cameras:
@@ -125,6 +124,22 @@ def _lens_numbers(properties: JsonObject) -> tuple[list[float], list[float], boo
     return size, polynomial, properties.get("polynomial-type", back) == back
 
 
+def sensor_lens(properties: JsonObject) -> LensModel:
+    """Return the lens of a calibration's properties.
+
+    Raises:
+        ValueError, KeyError: They are no f-theta lens.
+    """
+    _, polynomial, goes_back = _lens_numbers(properties)
+    given = (*polynomial, *[0.0] * (DEGREE + 1 - len(polynomial)))
+    c, d, e = (
+        float(properties.get(f"linear-{name}", usual))
+        for name, usual in zip("cde", LensModel.linear, strict=True)
+    )
+    forward, backward = ((), given) if goes_back else (given, ())
+    return LensModel("ftheta", forward, backward, (c, d, e))
+
+
 def mount(sensor: JsonObject) -> F64:
     """Return the ``(4, 4)`` pose of a camera in the rig: the nominal mount, turned and shifted by
     the estimated corrections.
@@ -162,7 +177,7 @@ def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
 
 def pixel_to_angle(camera: CameraSpec) -> F64:
     """Return coefficients ``(6,)`` of the angle (rad) as a polynomial of the distance (pixels) from
-    the principal point.
+    the principal point; of an f-theta lens before its matrix of c, d and e.
 
     A pinhole has theta = atan(r / f). Least squares over the image, with the constant zero; f is
     the mean of both focal lengths.
@@ -185,7 +200,10 @@ def pixel_to_angle(camera: CameraSpec) -> F64:
     if camera.lens is not None:
         rays = rays_of(camera)
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        away = np.hypot(x - camera.K[0, 2], y - camera.K[1, 2]).ravel() / reach
+        offset = np.stack([x - camera.K[0, 2], y - camera.K[1, 2]], axis=-1).reshape(-1, 2)
+        c, d, e = camera.lens.linear
+        plane = offset @ np.linalg.inv([[c, d], [e, 1.0]]).T
+        away = np.linalg.norm(plane, axis=1) / reach
         radius = away[rays.seen]
         across = np.linalg.norm(rays.ray[rays.seen, :2], axis=1)
         angle = np.arctan2(across, rays.ray[rays.seen, 2])
@@ -196,6 +214,7 @@ def pixel_to_angle(camera: CameraSpec) -> F64:
 
 def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
     coefficients = " ".join(repr(float(c)) for c in pixel_to_angle(camera))
+    linear = LensModel.linear if camera.lens is None else camera.lens.linear
     properties = {
         "Model": "ftheta",
         "width": str(camera.width),
@@ -204,9 +223,7 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
         "cy": repr(float(camera.K[1, 2])),
         "polynomial": coefficients,
         "polynomial-type": "pixeldistance-to-angle",
-        "linear-c": "1.0",
-        "linear-d": "0.0",
-        "linear-e": "0.0",
+        **{f"linear-{name}": repr(float(x)) for name, x in zip("cde", linear, strict=True)},
     }
     turn = Rotation.from_matrix(camera.T_rig_camera[:3, :3] @ RIG_FROM_LEVEL_CAMERA.T)
     mount = {

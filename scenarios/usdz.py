@@ -49,9 +49,9 @@ RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
 GROUND_CELL_M = 2.0
 # Words in AlpaSim's free-text labels, the first match deciding; all else is "other".
 LABELS = (
+    ("motor", "motorcycle"),  # a motorcyclist is no cyclist
     ("cyclist", "cyclist"),
     ("bicycle", "cyclist"),
-    ("motor", "motorcycle"),
     ("bike", "cyclist"),
     ("rider", "cyclist"),
     ("pedestrian", "pedestrian"),
@@ -262,6 +262,8 @@ def label_of(text: str) -> str:
     Example:
         >>> label_of("heavy_truck"), label_of("person"), label_of("stroller")
         ('truck', 'pedestrian', 'other')
+        >>> label_of("motorcyclist"), label_of("motorbike"), label_of("bicyclist")
+        ('motorcycle', 'motorcycle', 'cyclist')
     """
     return next((label for word, label in LABELS if word in text.lower()), "other")
 

@@ -180,7 +180,8 @@ def frame_times(scenario: Scenario, camera: CameraSpec) -> list[list[int]]:
     first_us = int(scenario.ego_log.t_us[0])
     last_us = int(scenario.ego_log.t_us[-1])
     shutter_us = camera.shutter_us or SHUTTER_US
-    ends = range(scenario.start_us, last_us + 1, scenario.rates.camera_us)
+    period_us = camera.interval_us or scenario.rates.camera_us
+    ends = range(scenario.start_us, last_us + 1, period_us)
     frames = [[end - shutter_us, end] for end in ends if end - shutter_us >= first_us]
     if not frames:
         raise InputError(

@@ -33,6 +33,7 @@ from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.fixers.bundle import read_bundle, weights_to_give
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.fixers.pixel_network import DTYPES
+from alpasim_plugin.fixers.settings import WeightsStamp, weights_stamp
 
 Precision = Literal["fp32", "bf16"]
 Net = TypeVar("Net", bound=nn.Module)
@@ -75,7 +76,7 @@ def load_networks(settings: LatentFixerSettings, device: str = "cpu") -> Network
         InputError: Weights that are missing or do not fit.
         InfrastructureError: The device is not here.
     """
-    return _load(settings, require_device(device))
+    return _load(settings, require_device(device), weights_stamp(settings.weights))
 
 
 def streaming_dit(
@@ -141,7 +142,7 @@ def decode(
 
 
 @lru_cache(maxsize=4)
-def _load(settings: LatentFixerSettings, device: str) -> Networks:
+def _load(settings: LatentFixerSettings, device: str, _: WeightsStamp) -> Networks:
     parts = Parts(settings)
     plain = parts.dit()
     dtype = DTYPES[settings.precision]

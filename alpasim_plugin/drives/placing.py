@@ -19,7 +19,7 @@ from alpasim_plugin.core.geometry import (
     trajectory_from_poses,
     unit,
 )
-from alpasim_plugin.core.types import F64, Actor, HeightField, LaneMap, Trajectory
+from alpasim_plugin.core.types import F64, Actor, HeightField, LaneMap, Signal, Trajectory
 from alpasim_plugin.drives.ground import GroundStrip, fit_ground
 from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.world.ground import from_points, height_at
@@ -335,15 +335,50 @@ def given_map(
             f"{path}: its nearest lane lies {np.median(away):.1f} m from the drive: {dx:+.1f} m in x and {dy:+.1f} m in y",
             "give the map of this street, in the coordinates of the poses",
         )
+    return laid_map(lane_map, placed.ground), (
+        f"the road is that of {path.name}, laid onto the ground that was found",
+        *notes,
+    )
 
+
+def laid_map(lane_map: LaneMap, ground: HeightField) -> LaneMap:
+    """Return a map whose lines lie on another ground; what stands on its own ground, poles, signs
+    and lights, stands as high above the other one.
+    """
     lanes = {}
     for key, lane in lane_map.lanes.items():
         edges: dict[str, Any] = {
-            name: laid(getattr(lane, name), placed.ground) for name in ("centre", "left", "right")
+            name: laid(getattr(lane, name), ground) for name in ("centre", "left", "right")
         }
         lanes[key] = replace(lane, **edges)
-    borders = tuple(laid(edge, placed.ground) for edge in lane_map.road_edges)
-    return replace(lane_map, lanes=lanes, road_edges=borders), (
-        f"the road is that of {path.name}, laid onto the ground that was found",
-        *notes,
+    road = np.concatenate([lane.centre for lane in lane_map.lanes.values()])
+    nearest_road = scipy.spatial.KDTree(road[:, :2])
+
+    def raised_m(point: F64) -> float:
+        """Return how much higher the other ground is than the map's road beside a point."""
+        _, i = nearest_road.query(point[:2])
+        return float(height_at(ground, point[None])[0] - road[i, 2])
+
+    def raised(points: F64) -> F64:
+        return points + np.array([0.0, 0.0, raised_m(points[0])])
+
+    def signal_on(one: Signal) -> Signal:
+        head = None if one.head is None else raised(one.head[None])[0]
+        return replace(one, stop=laid(one.stop, ground), head=head)
+
+    lines: dict[str, Any] = {
+        name: tuple(laid(line, ground) for line in getattr(lane_map, name))
+        for name in ("road_edges", "drivable_areas", "crosswalks", "stop_lines")
+    }
+    return replace(
+        lane_map,
+        lanes=lanes,
+        markings=tuple(replace(one, xyz=laid(one.xyz, ground)) for one in lane_map.markings),
+        poles=tuple(raised(pole) for pole in lane_map.poles),
+        signs=tuple(
+            (shifted(0.0, 0.0, raised_m(pose[:3, 3])) @ pose, box) for pose, box in lane_map.signs
+        ),
+        signals=lane_map.signals and tuple(signal_on(one) for one in lane_map.signals),
+        give_way=tuple(signal_on(one) for one in lane_map.give_way),
+        **lines,
     )

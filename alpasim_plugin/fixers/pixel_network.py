@@ -17,6 +17,7 @@ from alpasim_plugin.fixers.network.pixel_generator import (
 )
 from alpasim_plugin.fixers.network.reference_blend import Operations
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
+from alpasim_plugin.fixers.settings import WeightsStamp, weights_stamp
 
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
@@ -40,11 +41,12 @@ def load_generator(settings: PixelFixerSettings, device: str = "cpu") -> LoadedG
         InputError: Weights that are missing or do not fit.
         InfrastructureError: The device is not here.
     """
-    return _load(settings.model_copy(update={"keep_render": True}), require_device(device))
+    kept = settings.model_copy(update={"keep_render": True})
+    return _load(kept, require_device(device), weights_stamp(settings.weights))
 
 
 @lru_cache(maxsize=4)
-def _load(settings: PixelFixerSettings, device: str) -> LoadedGenerator:
+def _load(settings: PixelFixerSettings, device: str, _: WeightsStamp) -> LoadedGenerator:
     if settings.weights.bundle is not None:
         bundle = read_bundle(settings.weights.bundle, settings)
         net = PixelGenerator.from_state_dict(bundle.parts["generator"], settings.weights.bundle)

@@ -287,3 +287,19 @@ def _absolute(document: Document) -> Document:
         if isinstance(value, str)
     }
     return replace(document, data={**document.data, "weights": {**weights, **paths}})
+
+
+WeightsStamp = tuple[tuple[str, int, int], ...]  # path, time of change in nanoseconds, bytes
+
+
+def weights_stamp(weights: WeightsSettings) -> WeightsStamp:
+    """Return the files that weights name, with their times of change and sizes: what is kept of
+    them in a process is kept under this, so that a file that was replaced is read again.
+    """
+    named = [value for value in weights.model_dump().values() if isinstance(value, str)]
+    stamps = []
+    for name in named:
+        if os.path.isfile(name):
+            status = os.stat(name)
+            stamps.append((name, status.st_mtime_ns, status.st_size))
+    return tuple(stamps)

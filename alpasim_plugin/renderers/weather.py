@@ -103,7 +103,7 @@ class WeatherRenderer(Renderer):
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the base renderer's recorded frames in the weather, with the ego where it was."""
-        return [replace(one, read=partial(self._read, one)) for one in self.base.recorded()]
+        return [replace(one, read=partial(self._recorded, one)) for one in self.base.recorded()]
 
     def facts(self) -> Mapping[str, Any]:
         """Return the base renderer's facts and the weather."""
@@ -127,19 +127,27 @@ class WeatherRenderer(Renderer):
             request.actors,
             lambda: image,
         )
-        return replace(frame, rgb=self._read(taken)[0])
+        T_world_rig = request.T_world_camera[-1] @ inverse(camera.T_rig_camera)
+        return replace(frame, rgb=self._read(taken, T_world_rig)[0])
 
-    def _read(self, frame: RecordedFrame) -> tuple[U8, F32]:
-        """Return an image in this weather, and its depth."""
+    def _recorded(self, frame: RecordedFrame) -> tuple[U8, F32]:
+        """Return a recorded image in this weather, and its depth; the ego is where its camera's
+        mount says, and where the log says for a camera that the scenario does not mount.
+        """
+        for camera in self.scenario.cameras:
+            if camera.name == frame.camera:
+                return self._read(frame, frame.T_world_camera @ inverse(camera.T_rig_camera))
+        log = self.scenario.ego_log
+        within_us = np.clip(frame.t_us, log.t_us[0], log.t_us[-1])
+        return self._read(frame, interpolate(log, within_us))
+
+    def _read(self, frame: RecordedFrame, T_world_rig: F64) -> tuple[U8, F32]:
+        """Return an image in this weather, and its depth, with the ego at a pose ``(4, 4)``."""
         rgb, depth = frame.read()
         environment = self.scenario.environment
         sizes = {one.actor_id: one.box for one in self.scenario.actors}
         boxes = [(T, sizes[name]) for name, T in frame.actors.items() if name in sizes]
         view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground, boxes)
-        T_world_rig = interpolate(self.scenario.ego_log, frame.t_us)
-        for camera in self.scenario.cameras:
-            if camera.name == frame.camera:
-                T_world_rig = frame.T_world_camera @ inverse(camera.T_rig_camera)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
         if environment.rain or environment.snow:

@@ -140,6 +140,19 @@ def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overri
         assert reply.driver_data == b"for the driver"
 
 
+def test_frames_of_a_camera_in_one_call_follow_one_another_by_time(upstream, overrides):
+    frames = drive(3)
+
+    def answered(asked):
+        call = sensorsim_pb2.AggregatedRenderRequest(rgb_requests=asked)
+        with in_front_of(upstream, overrides=overrides) as (stub, _):
+            return [one.image_bytes for one in stub.render_aggregated(call).rgb_returns]
+
+    in_order = answered(frames)
+    assert answered(frames[::-1])[::-1] == in_order
+    assert answered(frames[2:]) != in_order[2:]  # the fixer's past counts
+
+
 def test_the_version_changes_with_settings_and_weights_and_names_the_upstream(
     upstream, overrides, tmp_path
 ):

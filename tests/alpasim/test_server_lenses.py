@@ -128,6 +128,20 @@ def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black():
     assert picture[picture.shape[0] // 2, 160].tolist() == [200, 200, 200]
 
 
+@pytest.mark.parametrize("backward", [False, True])
+def test_the_pinhole_of_a_lens_that_sees_100_degrees_shows_80(backward):
+    spec = ftheta(backward)
+    p = spec.ftheta_param
+    del p.angle_to_pixeldist_poly[:], p.pixeldist_to_angle_poly[:]
+    (p.pixeldist_to_angle_poly if backward else p.angle_to_pixeldist_poly).extend(
+        [0.0, np.deg2rad(100) / 185] if backward else [0.0, 185 / np.deg2rad(100)]
+    )
+    assert len(read_sides(spec, 320, 180)) > 1
+    straight = straight_of(spec, 320, 180)
+    half_rad = np.arctan(straight.size[0] / 2 / straight.K[0, 0])
+    assert np.rad2deg(half_rad) < 81
+
+
 def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
     spec = fisheye()
     spec.opencv_fisheye_param.max_angle = 0.6

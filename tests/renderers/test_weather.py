@@ -237,6 +237,39 @@ def test_night_is_dark_but_for_the_beams_of_the_ego():
     assert wall[38, 50] > 2 * wall[20, 50]  # the upper edge of a low beam
 
 
+@pytest.mark.parametrize("name", ["front", "camera_front_wide_120fov"])
+def test_beams_start_at_the_ego_of_the_request_whatever_its_camera_is_called(name, monkeypatch):
+    """The rig stands 3 m beside the recorded path, and later than the recording ends."""
+    scenario = scene("time=night")
+    given = frame_request(scenario, 100, 60)
+    T_world_rig = np.eye(4)
+    T_world_rig[:3, 3] = 10.0, 3.0, 0.0
+    camera = replace(given.camera, name=name, width=100, height=60, K=K)
+    asked = replace(
+        given,
+        t_us=int(scenario.ego_log.t_us[-1]) + 1_000_000,
+        camera=camera,
+        T_world_camera=np.stack([T_world_rig @ camera.T_rig_camera] * 2),
+    )
+    rigs = []
+    monkeypatch.setattr(
+        SceneLights,
+        "lux",
+        lambda self, view, rig: rigs.append(rig) or np.zeros((60, 100), np.float32),
+    )
+
+    class Wall:
+        lookahead = block = 1
+        has_history = False
+
+        def render(self, request):
+            depth = depth_of_wall(20.0)
+            return Frame(request.t_us, request.camera.name, GREY, np.ones_like(depth), depth)
+
+    WeatherRenderer(Wall(), scenario, 0).render(asked)
+    assert np.allclose(rigs[0], T_world_rig)
+
+
 @pytest.mark.parametrize(("heading_x", "is_red"), [(1.0, True), (-1.0, False)])
 def test_lamps_of_road_users_are_red_from_behind_and_white_from_ahead(heading_x, is_red):
     actor, poses = car(heading_x)

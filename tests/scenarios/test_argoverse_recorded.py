@@ -166,8 +166,8 @@ def test_real_calibration(shared_data):
     front = cameras["ring_front_center"]
     assert (front.width, front.height) == (1550, 2048)
     assert_allclose(
-        front.K, [[1776.041484, 0, 777.990573], [0, 1776.041484, 1013.524325], [0, 0, 1]], atol=1e-6
-    )
+        front.K, [[1776.041484, 0, 778.490573], [0, 1776.041484, 1014.024325], [0, 0, 1]], atol=1e-6
+    )  # the files count from pixel centres
     assert_allclose(front.T_rig_camera[:3, 2], [1, 0, 0], atol=0.01)  # looks ahead
     assert_allclose(front.T_rig_camera[:3, 1], [0, 0, -1], atol=0.01)  # image down is world down
     assert front.T_rig_camera[2, 3] == pytest.approx(1.398 + 0.33, abs=1e-3)

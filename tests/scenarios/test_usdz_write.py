@@ -21,7 +21,7 @@ from scenarios.ftheta import pixel_to_angle
 from scenarios.load import load_scenario
 from scenarios.map_lines import alpasim_view, rails, with_vertices
 from scenarios.usdz import read_usdz
-from scenarios.usdz_write import alpasim_cameras, write_usdz
+from scenarios.usdz_write import alpasim_cameras, frame_times, write_usdz
 
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
 
@@ -219,3 +219,9 @@ def test_a_lane_without_edges_is_widened():
     left, right = rails(Lane("a", centre, None, None))
     assert_allclose(left[:, 1], 1.85)
     assert_allclose(right[:, 1], -1.85)
+
+
+def test_a_camera_of_its_own_rate_is_asked_for_frames_at_that_rate(straight):
+    slow = replace(straight.cameras[0], interval_us=3 * straight.rates.camera_us)
+    ends = [end for _, end in frame_times(straight, slow)]
+    assert set(np.diff(ends)) == {3 * straight.rates.camera_us}

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.interfaces import BlockRule, Renderer
 from alpasim_plugin.core.parts import RendererSpec, build, complete, resolve_renderer
-from alpasim_plugin.core.types import U8, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import U8, CameraSpec, Frame, RenderRequest, Scenario
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
@@ -267,9 +267,26 @@ def advertised(scenario: Scenario) -> list[sensorsim_pb2.AvailableCamerasReturn.
     """
     cameras = [wire_camera(camera) for camera in scenario.cameras]
     if cameras and all(camera.logical_id != FRONT_WIDE for camera in cameras):
-        front = next((camera for camera in cameras if camera.logical_id == "front"), cameras[0])
         alias = sensorsim_pb2.AvailableCamerasReturn.AvailableCamera()
-        alias.CopyFrom(front)
+        alias.CopyFrom(wire_camera(front_camera(scenario)))
         alias.logical_id = alias.intrinsics.logical_id = FRONT_WIDE
         cameras.append(alias)
     return cameras
+
+
+def front_camera(scenario: Scenario) -> CameraSpec:
+    """Return the camera that AlpaSim's presets mean by their name of the front one: ``front``, else
+    the first.
+    """
+    named = (camera for camera in scenario.cameras if camera.name == "front")
+    return next(named, scenario.cameras[0])
+
+
+def scene_camera(scenario: Scenario, logical_id: str) -> CameraSpec | None:
+    """Return the camera of a scene that a caller names, which may be by the name that `advertised`
+    adds; None where it is a camera of the caller's own.
+    """
+    for camera in scenario.cameras:
+        if camera.name == logical_id:
+            return camera
+    return front_camera(scenario) if logical_id == FRONT_WIDE and scenario.cameras else None

@@ -100,7 +100,9 @@ class FrameServer:
             else:
                 nodes[view.key] = known
         if missing:
-            asked, seen = zip(*missing.values(), strict=True)
+            # A camera's frames follow one another by time, however a call lists them.
+            by_time = sorted(missing.values(), key=lambda one: one[1].t_us)
+            asked, seen = zip(*by_time, strict=True)
             for item, view in zip(self.source.render(asked, seen, left), seen, strict=True):
                 nodes[view.key] = self._fixed(item, view, left)
         images = [nodes[view.key].state.image for view in views]

@@ -21,7 +21,12 @@ import cv2
 import grpc
 import numpy as np
 
-from alpasim_plugin.alpasim.server.caches import SceneCache, SceneEntry
+from alpasim_plugin.alpasim.server.caches import (
+    SceneCache,
+    SceneEntry,
+    front_camera,
+    scene_camera,
+)
 from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import exposure_of
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
@@ -135,15 +140,18 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
 def asked_of(
     entry: SceneEntry, request: Request, view: View, T_rig_camera: F64, sides: Sequence[Lens]
 ) -> list[RenderRequest]:
-    """Return what is to be drawn by each pinhole that covers the request's lens.
+    """Return what is to be drawn by each pinhole that covers the request's lens; a camera of the
+    scene bears the scene's name of it.
 
     Raises:
         InputError: A track that the scene does not have.
     """
     actors = boxes_at(entry, view)
+    own = scene_camera(entry.scenario, view.camera)
+    name = own.name if own else view.camera
     asked = []
     for side in sides:
-        camera = side.spec(view.camera, T_rig_camera, view.t_us - view.start_us)
+        camera = side.spec(name, T_rig_camera, view.t_us - view.start_us)
         T = view.T_world_camera @ side.T_lens_pinhole
         exposure = exposure_of(request.camera_intrinsics, view, side, actors)
         asked.append(RenderRequest(view.t_us, camera, T, actors, exposure=exposure))
@@ -247,7 +255,8 @@ class LocalSource:
             frames = entry.render(asked, entry.reads_device)
             place = frames[0].device if entry.reads_device else "cpu"
             sdmap = drawn_map(entry, asked, sides, place)
-        rendered = Rendered(joined(view.camera, sides, frames), sdmap, blind_of(sides))
+        frame = joined(view.camera, sides, frames).changed(camera=view.camera)
+        rendered = Rendered(frame, sdmap, blind_of(sides))
         if sdmap is None:
             return rendered
         ahead = max(range(len(sides)), key=lambda i: float(sides[i].T_lens_pinhole[2, 2]))
@@ -426,11 +435,11 @@ def forget_if_many(known: dict[Any, Any]) -> None:
 
 
 def mount_of(entry: SceneEntry, view: View) -> F64:
-    """Return the mounting of a scene's camera of that name, else of its first: renderers that
-    follow the recorded path want the rig.
+    """Return the mounting of the scene's camera that a view names, else of its front one: renderers
+    that follow the recorded path want the rig.
     """
-    cameras = {camera.name: camera for camera in entry.scenario.cameras}
-    return cameras.get(view.camera, entry.scenario.cameras[0]).T_rig_camera
+    scenario = entry.scenario
+    return (scene_camera(scenario, view.camera) or front_camera(scenario)).T_rig_camera
 
 
 def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]) -> list[bytes]:

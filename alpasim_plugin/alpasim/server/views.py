@@ -170,10 +170,8 @@ class Straight:
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
-    """Return the pinhole for the images ``(height, width)`` of a lens; see `read_sides`.
-
-    Raises:
-        InputError: Also a view of more than 80 degrees from the axis.
+    """Return the pinhole for the images ``(height, width)`` of a lens, as far as one plane can carry
+    what it sees; see `read_sides`.
     """
     what = ("straight", width, height)
     return lenses.get(spec, what, lambda: _straight(spec, width, height))
@@ -181,7 +179,7 @@ def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Stra
 
 def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
     camera = camera_of(spec, width, height)
-    if camera.lens is not None and camera.lens.kind == "fisheye":
+    if camera.lens is not None:
         widest_rad = min(camera.lens.max_angle_rad or WIDEST_RAD, WIDEST_RAD)
         camera = replace(camera, lens=replace(camera.lens, max_angle_rad=widest_rad))
     lens = lens_of(camera)

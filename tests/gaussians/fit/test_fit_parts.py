@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.image_metrics import ssim
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.gaussians import GaussianCloud
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.fit.model import (
     RowAdam,
     ScreenGradients,
@@ -24,7 +25,10 @@ from alpasim_plugin.gaussians.fit.start import (
     start_from_depth,
     start_in_boxes,
 )
+from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 from alpasim_plugin.gaussians.sh import dc_from_rgb
+from tests.camera_builders import ahead
 from tests.gaussians.fit.conftest import BOX, FAR, actor_pose
 from tests.gaussians.gaussian_scenes import covariances, random_cloud, random_rigid
 from tests.gaussians.gradient_scenes import central_differences, cloud_of
@@ -217,6 +221,30 @@ def test_the_panorama_shows_the_sky_that_the_views_saw(posed):
         assert error.mean() < 0.03
     assert np.isfinite(sky.panorama).all()
     assert sky_of([replace(v, sky=None) for v in posed.views]) is None
+
+
+def test_the_panorama_of_views_is_not_turned():
+    """Brightness rises to the left by a level every 0.06 degrees; half a pixel would be 2."""
+    azimuth = np.arange(WIDTH) * 2 * np.pi / WIDTH
+    ramp = 0.5 + 0.4 * np.sin(12 * azimuth)
+    true = Sky(np.repeat(np.repeat(ramp[None, :, None], HEIGHT, 0), 3, 2).astype(np.float32))
+    views = []
+    for yaw in (0.0, 0.4):
+        camera = PinholeCamera.from_pose(
+            320,
+            180,
+            np.array([[960.0, 0, 160], [0, 960.0, 90], [0, 0, 1]]),
+            se2(0, 0, yaw) @ ahead(),
+        )
+        rgb = np.rint(true.image(camera) * 255).astype(np.uint8)
+        views.append(PosedView(camera, rgb, sky=np.ones((180, 320), np.bool_)))
+    found = sky_of(views)
+    off = [
+        (found.image(view.camera) - true.image(view.camera))[10:-10, 10:-10, 0] for view in views
+    ]
+    slope = [np.gradient(true.image(view.camera)[10:-10, 10:-10, 0], axis=1) for view in views]
+    turned_px = np.vdot(slope, off) / np.vdot(slope, slope)
+    assert abs(turned_px) < 0.2
 
 
 # --- recipe
