@@ -14,6 +14,7 @@ from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_header, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import PixelGenerator
+from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from tests.block_fixers.fixer_cases import small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
@@ -249,3 +250,13 @@ def test_weights_that_read_no_references_leave_them_alone(bundle):
         for frame in (FRAMES[0], with_reference(FRAMES[0], 200))
     )
     assert np.array_equal(plain.rgb, given.rgb)
+
+
+def test_weights_that_were_replaced_under_their_name_are_read_again(tmp_path):
+    file = write_bundle(tmp_path / "small.safetensors")
+    first = load_generator(at(file))
+    assert load_generator(at(file)) is first
+    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
+    other = {"generator": PixelGenerator(SIZES).state_dict()}
+    save_bundle(file, other, settings, trained=True, note="10 updates")
+    assert load_generator(at(file)).note == "10 updates"
