@@ -143,7 +143,7 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         for t_us in (0, request.t_us):
             traffic.reset()
             if device != "cpu":
-                graph._upload(device)[0].capacity = capacity
+                graph._upload(device, graph.background).clouds.capacity = capacity
             one = replace(request, t_us=t_us)
             (frame,) = runner.fix(fixer, fixer.step, runner.render([one]))
         return frame
