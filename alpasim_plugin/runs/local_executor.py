@@ -143,7 +143,8 @@ def _pool(workers: int, threads: int) -> Iterator[tuple[ProcessPoolExecutor, Cal
     is left early, they are ended.
     """
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, _context(threads), _begin)
+    with _environment(threads):  # the pool's locks start a process, too: the resource tracker
+        pool = ProcessPoolExecutor(workers, _context(threads), _begin)
 
     def end_workers() -> None:
         for worker in set(multiprocessing.active_children()) - others:

@@ -34,15 +34,24 @@ from alpasim_plugin.runs.score_logs import scenario_finder
 from scenarios.load import load_scenario
 from scenarios.suite import shipped_names
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     """A short curve, as a file that both sides read."""
+    return written_curve(
+        tmp_path_factory.mktemp("scenes"), duration_us=1_200_000, warmup_us=300_000
+    )
+
+
+@pytest.fixture(scope="module")
+def long_scene(tmp_path_factory):
+    """A curve that lasts longer than the warm-up of AlpaSim's own timeline, 1.7 s."""
+    return written_curve(tmp_path_factory.mktemp("scenes"), duration_us=2_000_000)
+
+
+def written_curve(folder, **timing):
     written = yaml.safe_load(shipped_names()["smoke/curve"].read_text())
-    path = tmp_path_factory.mktemp("scenes") / "curve.yaml"
-    timing = {"duration_us": 1_200_000, "warmup_us": 300_000}
+    path = folder / "curve.yaml"
     path.write_text(yaml.safe_dump(written | {"scene_id": "short-curve", "timing": timing}))
     return str(path)
 
@@ -77,16 +86,20 @@ def serve(name, implementation, interceptor=None):
 def driver(scene):
     """Our own policy behind AlpaSim's driver service."""
     calls = Calls()
+    service = lane_camera_service(scene)
+    server, address = serve("EgodriverService", service, calls)
+    yield service, address, calls
+    server.stop(0)
+
+
+def lane_camera_service(scene):
     spec = resolve("policy", "lane-camera")
-    service = DriverService(
+    return DriverService(
         spec.name,
         spec.digest,
         lambda scenario: build(spec, scenario=scenario),
         scenario_finder([scene]),
     )
-    server, address = serve("EgodriverService", service, calls)
-    yield service, address, calls
-    server.stop(0)
 
 
 def drive(scenario, renderer, policy):
@@ -280,20 +293,21 @@ def test_our_driver_service_is_tolerant_where_alpasim_needs_it(
     assert SERVICE_PATHS["EgodriverService"] == "/egodriver.EgodriverService/"
 
 
-@pytest.mark.slow
-def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(scene, driver, capsys):
-    timing = ["--limit-ms", "60000", "--json"]
-    assert run_command(["check", "driver", driver[1], "--scenario", scene, *timing]) == 0
+def test_the_pre_flight_check_of_a_good_and_of_a_bad_driver(long_scene, capsys):
+    timing = ["--scenario", long_scene, "--limit-ms", "60000", "--json"]
+    server, address = serve("EgodriverService", lane_camera_service(long_scene))
+    assert run_command(["check", "driver", address, *timing]) == 0
+    server.stop(0)
     told = json.loads(capsys.readouterr().out)
     good = {one["name"]: one["result"] for one in told["checks"]}
     assert list(told["scenes"].values()) == ["no event"]
-    assert set(good.values()) == {"passed", "noted"}
+    assert set(good.values()) <= {"passed", "noted"}
     assert good["samples for minADE"] == "passed"
     late = egodriver_pb2.DriveResponse()
     for t in (0, 700_000, 600_000):
         late.trajectory.poses.add(timestamp_us=t, pose={"quat": {"w": 1.0}})
     server, address = serve("EgodriverService", Scripted(late))
-    assert run_command(["check", "driver", address, "--scenario", scene, *timing]) == 1
+    assert run_command(["check", "driver", address, *timing]) == 1
     server.stop(0)
     bad = {
         one["name"]: (one["result"], one["text"])

@@ -21,17 +21,26 @@ DRIVE = (
 
 def simrun(folder, *arguments):
     """Run a command in a folder by a script that lies elsewhere, as the installed one does."""
+    return run_python(folder, str(written_script(folder)), *arguments)
+
+
+def written_script(folder):
+    """Write the script of the command beside the folder; return its path."""
     script = folder.parent / "bin" / "simrun"
     script.parent.mkdir(exist_ok=True)
     script.write_text(SCRIPT)
+    return script
+
+
+def run_python(folder, *arguments):
+    """Run Python in a folder, with none of its variables that say what may be imported."""
     environment = {
         key: value
         for key, value in os.environ.items()
         if key not in ("PYTHONPATH", "PYTHONSAFEPATH")
     }
-    command = [sys.executable, str(script), *arguments]
     return subprocess.run(
-        command,
+        [sys.executable, *arguments],
         cwd=folder,
         env=environment,
         capture_output=True,

@@ -10,8 +10,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.subprocesses import OURS, SAFE_PATH, own_path_only
-from tests.core.hostile_commands import DRIVE, simrun
-from tests.examples import first_of
+from tests.core.hostile_commands import DRIVE, REPO, run_python, simrun
 
 # What libraries of ours import if it is there, and what Python itself imports when it starts a
 # worker.
@@ -80,8 +79,8 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize("name", first_of(NAMES))
 @pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also_in_workers(
     hostile, name
 ):
@@ -111,6 +110,39 @@ def test_a_part_of_the_working_directory_works_by_name_with_what_it_imports_also
     assert done.returncode == 0, done.stderr
     assert json.loads((hostile / "mine" / "run.json").read_text())["policies"]
     assert ran(hostile) == ""
+
+
+POOL = """
+import os, sys
+sys.path.append({repo!r})
+from alpasim_plugin.runs.local_executor import run_jobs
+if __name__ == "__main__":
+    print(sorted(value for _, value in run_jobs(abs, [-1, -2], 2, threads={threads})))
+"""
+
+
+@pytest.mark.parametrize("threads", [1, 2], ids=["forked from a server", "spawned"])
+def test_no_process_that_a_pool_of_workers_starts_imports_from_the_working_directory(
+    hostile, threads
+):
+    script = hostile.parent / "pool.py"
+    script.write_text(POOL.format(repo=str(REPO), threads=threads))
+    done = run_python(hostile, str(script))
+    assert (done.returncode, done.stdout) == (0, "[1, 2]\n"), done.stderr
+    assert ran(hostile) == ""
+
+
+def test_folders_named_like_ours_are_never_taken_for_them(tmp_path):
+    folder = tmp_path / "work"
+    for name in ("policies", "evaluators", "scenarios", "configs"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "__init__.py").write_text("raise SystemError('the wrong package')\n")
+    listed = simrun(folder, "list", "policies", "--json")
+    assert "lane-camera" in json.loads(listed.stdout), listed.stderr
+    first_on_the_path = "import sys; sys.path.append(sys.argv[1]); import alpasim_plugin"
+    refused = run_python(folder, "-c", first_on_the_path, str(REPO))
+    assert refused.returncode != 0
+    assert "'configs' of simrun is hidden by" in refused.stderr
 
 
 def test_only_what_a_named_file_imports_can_be_imported_beside_it(tmp_path):

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.core.hostile_commands import written_script
+
 pytestmark = pytest.mark.slow
 TOY = Path(__file__).parent / "toy"
 REPO = Path(__file__).resolve().parents[2]
@@ -43,8 +45,10 @@ class Installed:
     work: Path
 
     def simrun(self, *arguments, code=0):
-        """Run a command in the folder and return its JSON document."""
-        command = [str(self.python), "-m", "alpasim_plugin.cli.main", *arguments, "--json"]
+        """Run a command in the folder, as the installed one does from a script that lies elsewhere,
+        and return its JSON document.
+        """
+        command = [str(self.python), str(written_script(self.work)), *arguments, "--json"]
         path = os.pathsep.join([str(REPO), *(p for p in sys.path if "site-packages" in p)])
         environment = os.environ | {"PYTHONPATH": path}
         done = subprocess.run(
