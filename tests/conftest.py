@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.data_sets import shared_folder
 from tests.examples import PROFILE, examples
 from tests.laboratory import NOT_COLLECTED, laboratory_is_installed
 from tests.pages.browser import Browser, find_chromium
@@ -74,23 +75,13 @@ def same_threads():
         torch.set_num_threads(before)
 
 
-def find_shared_data():
-    """Return the folder of third-party data sets, or None where this machine has none.
-
-    ``SIMRUN_SHARED_DATA`` names it; otherwise ``../shared/data`` beside the checkout is tried.
-    """
-    named = os.environ.get("SIMRUN_SHARED_DATA")
-    folder = Path(named) if named else REPO.parent / "shared" / "data"
-    return folder if folder.is_dir() else None
-
-
 @pytest.fixture(scope="session")
 def shared_data():
     """Give the data folder or skip: its files have licences that keep them out of this
     repository.
     """
-    folder = find_shared_data()
-    if folder is None:
+    folder = shared_folder()
+    if not folder.is_dir():
         pytest.skip("third-party data sets absent (set SIMRUN_SHARED_DATA to their folder)")
     return folder
 

@@ -17,6 +17,7 @@ from alpasim_plugin.alpasim.bridge import build as building
 from alpasim_plugin.alpasim.bridge.client import main
 from tests.alpasim.service_cases import CAMERA
 from tests.alpasim.wire_environment import environment
+from tests.data_sets import shared_folder
 
 # AlpaSim's own pins (main, 3032e0c): alpasim_grpc wants protobuf < 5 and was built with grpcio
 # 1.62.3.
@@ -41,7 +42,7 @@ sys.exit(code)
 
 REPO = Path(__file__).resolve().parents[2]
 PAGE = REPO / "docs" / "alpasim.md"
-SCENES = REPO.parent / "shared" / "data" / "alpasim-golden" / "scenes"
+SCENES = shared_folder() / "alpasim-golden" / "scenes"
 WIZARD = "SIMRUN_ALPASIM_PYTHON"
 
 
@@ -132,6 +133,7 @@ def test_the_command_says_what_a_service_is(upstream, capsys, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.network
 @pytest.mark.timeout(3600)
 def test_the_wheel_installs_beside_alpasims_pins_and_talks_to_a_service(upstream, tmp_path):
     wheel = building.build(tmp_path / "dist")

@@ -24,8 +24,6 @@ from alpasim_plugin.core.subprocesses import MOST_BYTES, parts_print_to_stderr, 
 from alpasim_plugin.log import read_asl
 from policies.conformance import STRAIGHT, canned_scenario, observations
 
-pytestmark = pytest.mark.slow
-
 REPO = Path(__file__).resolve().parents[2]
 HEAVY = "torch numba scipy shapely pydantic yaml pyarrow typer av matplotlib"
 PAGE = (REPO / "docs" / "policies.md").read_text(encoding="utf-8")

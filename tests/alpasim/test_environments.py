@@ -35,6 +35,7 @@ WITH_NETWORKS = (
 
 
 @pytest.mark.slow
+@pytest.mark.network
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(
     ("packages", "module", "version", "tests"),

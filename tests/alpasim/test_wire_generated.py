@@ -68,6 +68,7 @@ def test_the_messages_load_under_another_name_beside_foreign_ones(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.network
 @pytest.mark.parametrize("protobuf", ["==4.25.*", "==5.29.*", ">=6,<7"])
 def test_the_messages_load_under_every_allowed_protobuf(tmp_path, protobuf):
     python = environment(tmp_path / "venv", f"protobuf{protobuf}", "grpcio>=1.62")
@@ -79,6 +80,7 @@ def test_the_messages_load_under_every_allowed_protobuf(tmp_path, protobuf):
 
 
 @pytest.mark.slow
+@pytest.mark.network
 def test_the_compiler_writes_what_is_checked_in(tmp_path):
     python = environment(tmp_path / "venv", f"grpcio-tools=={compiling.GENERATOR}", "setuptools<81")
     out = tmp_path / "out"

@@ -25,8 +25,6 @@ from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities 
 from alpasim_plugin.core.types import Vehicle  # noqa: E402
 from tests.control.can_ecu import LaneKeeper, serve  # noqa: E402
 
-pytestmark = pytest.mark.slow
-
 
 class NoCamera(Renderer):
     def render(self, request):
@@ -202,6 +200,7 @@ def drive(scenario, name):
     return log, policy.facts()
 
 
+@pytest.mark.slow
 def test_a_control_unit_drives_a_curve_and_twice_the_same(curve):
     log, facts = drive(curve, "test-drive-one")
     assert facts["frames"]["fresh"] == 400  # every 10 ms of 4 s
@@ -217,6 +216,7 @@ def test_a_control_unit_drives_a_curve_and_twice_the_same(curve):
     assert_array_equal(log.ego.xyz, again.ego.xyz)
 
 
+@pytest.mark.slow
 def test_without_a_control_unit_the_ego_stops_and_the_facts_say_so():
     scenario = load_scenario(
         "smoke/straight", overrides=("timing.duration_us=3000000", "timing.warmup_us=200000")

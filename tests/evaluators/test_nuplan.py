@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +10,9 @@ import shapely
 
 from evaluators.metrics import nuplan
 from evaluators.metrics.states import EgoStates, Tracks, savitzky_golay
+from tests.data_sets import shared_folder
 
-FIXTURES = Path(__file__).parents[3] / "shared" / "data" / "nuplan-devkit-fixtures"
+FIXTURES = shared_folder() / "nuplan-devkit-fixtures"
 OF_PLANS = (
     "planner_expert_average_l2_error_within_bound",
     "planner_miss_rate_within_bound",
@@ -119,7 +119,7 @@ def found_statistics(name, scene):
     raise AssertionError(f"no definition of ours is held to {name}")
 
 
-@pytest.mark.skipif(not FILES, reason="../shared/data/nuplan-devkit-fixtures is absent")
+@pytest.mark.skipif(not FILES, reason=f"the data set {FIXTURES} is absent")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_the_devkits_test_vectors_give_its_series_to_all_printed_digits_and_its_statistics_nearly(
     path,

@@ -26,8 +26,6 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 import alpasim_plugin.gym as doors  # noqa: E402
 from alpasim_plugin.gym.env import DriveEnv, HeldCommand  # noqa: E402
 
-pytestmark = pytest.mark.slow
-
 SMALL = "cameras=[{width: 64, height: 36}]"
 SHORT = ("timing.duration_us=1500000", "timing.warmup_us=300000")
 STRAIGHT = "road.segments=[{kind: straight, length_m: 220}]"
