@@ -14,12 +14,7 @@ import pytest
 
 NOBODY = 65534
 TOOLS = ("unshare", "setpriv", "mount")
-# The interpreter may lie in a folder that only root may enter: it is mounted again below an empty
-# folder that all may.
-SHOW = """
-mount -t tmpfs -o mode=755 none /mnt && mkdir /mnt/keep && mount --bind "{prefix}" /mnt/keep
-mount -t tmpfs -o mode=755 none "{closed}" && mkdir -p "{prefix}" && mount --move /mnt/keep "{prefix}"
-"""
+REPO = Path(__file__).resolve().parents[1]
 
 
 def can_become_nobody():
@@ -36,8 +31,16 @@ def can_become_nobody():
     )
 
 
+def is_open(path):
+    """Tell whether every user may read a file, or list and enter a folder."""
+    wanted = 0o005 if path.is_dir() else 0o004
+    return path.stat().st_mode & wanted == wanted
+
+
 as_root = pytest.mark.skipif(
-    not can_become_nobody(), reason="needs root that may mount, to become another user"
+    not can_become_nobody() or not is_open(Path(__file__)),
+    reason="needs root that may mount, to become another user, and a checkout whose files every "
+    "user may read",
 )
 
 
@@ -52,12 +55,38 @@ def shared_folder():
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _closed():
-    """Return the first folder on the way to the interpreter that other users may not enter."""
-    prefix = Path(sys.base_prefix)
-    return next(
-        (one for one in reversed((prefix, *prefix.parents)) if not one.stat().st_mode & 0o001), None
-    )
+def outermost_closed(path):
+    """Return the first folder on the way to a path, or itself, that other users may not enter."""
+    return next((folder for folder in (*reversed(path.parents), path) if not is_open(folder)), None)
+
+
+def distinct(*folders):
+    """Return the folders that lie in no other of them."""
+    return [folder for folder in dict.fromkeys(folders) if not set(folder.parents) & set(folders)]
+
+
+def lines_that_open(folders):
+    """Return lines of shell that let every user reach folders below some that only root may enter,
+    such as a clone in root's home: what these hold is mounted again below an empty folder that all
+    may enter. A folder that is closed itself is mounted piece by piece.
+    """
+    keep = ["mount -t tmpfs -o mode=755 none /mnt"]
+    cover = []
+    move = []
+    for folder in folders:
+        closed = outermost_closed(folder)
+        if closed is None:
+            continue
+        pieces = [folder] if is_open(folder) else sorted(folder.iterdir())
+        for piece in pieces:
+            kept = f"/mnt/{len(move)}"
+            make, parent = ("mkdir -p", piece) if piece.is_dir() else ("touch", piece.parent)
+            keep.append(f'{make} {kept} && mount --bind "{piece}" {kept}')
+            move.append(f'mkdir -p "{parent}" && {make} "{piece}" && mount --move {kept} "{piece}"')
+        line = f'mount -t tmpfs -o mode=755 none "{closed}"'
+        if line not in cover:
+            cover.append(line)
+    return "".join(f"{line}\n" for line in (*keep, *cover, *move)) if move else ""
 
 
 def run_as_nobody(
@@ -77,8 +106,7 @@ def run_as_nobody(
         timeout: Seconds.
         variables: Its environment, beside PATH.
     """
-    closed = _closed()
-    show = SHOW.format(prefix=sys.base_prefix, closed=closed) if closed is not None else ""
+    show = lines_that_open(distinct(Path(sys.base_prefix), Path(sys.prefix), REPO))
     become = f'exec setpriv --reuid={NOBODY} --regid={NOBODY} --clear-groups --no-new-privs --bounding-set=-all -- "$@"\n'
     script = f'set -e\n{show}{mounts}cd "{cwd}"\n{become}'
     environment = {"PATH": os.environ["PATH"], "LANG": "C.UTF-8", **variables}
