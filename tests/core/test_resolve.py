@@ -6,7 +6,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
-from alpasim_plugin.core.parts import complete, names, resolve, resolve_renderer, spec
+from alpasim_plugin.core.parts import complete, names, resolve, resolve_renderer
 from alpasim_plugin.core.parts.source import code_digest, reached
 from alpasim_plugin.core.parts.spec import KINDS
 
@@ -124,18 +124,16 @@ def test_a_module_edited_after_its_import_is_refused(tmp_path):
         resolve("policy", f"{file}:Mine")
 
 
-def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(
-    monkeypatch,
-):
-    home = "policies/simple.py"
-    digest = resolve("policy", "policies.simple:ConstantVelocity").digest
-    whole = spec.code_digest
-    monkeypatch.setattr(
-        spec,
-        "code_digest",
-        lambda file: whole(file) + ("edited" if str(file).endswith(home) else ""),
-    )
-    assert resolve("policy", "policies.simple:ConstantVelocity").digest != digest
+def test_a_class_named_through_its_package_has_the_digest_of_its_own_module(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    speeds = {"first_pack": 5.0, "equal_pack": 5.0, "edited_pack": 6.0}
+    for name, speed_mps in speeds.items():
+        Path(name).mkdir()
+        Path(name, "__init__.py").write_text("from .inner import Mine\n")
+        Path(name, "inner.py").write_text(f"class Mine:\n    speed_mps = {speed_mps}\n")
+    first, equal, edited = (resolve("policy", f"{name}:Mine").digest for name in speeds)
+    assert first == equal
+    assert first != edited
 
 
 def test_settings_in_brackets_make_another_arm_of_one_fixer():
