@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.errors import PolicyError, SimrunError
+from alpasim_plugin.core.errors import PolicyError, SimrunError, is_interruption
 from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.parts.blame import defined, raised
+from alpasim_plugin.core.parts.blame import defined, noted, raised, runs_users_code
 from alpasim_plugin.core.plan_check import (
     blank_scenario,
     plan_problem,
@@ -432,20 +432,24 @@ def _drive(
     """Return the plans, or a sentence where the policy raised."""
     road = PaintedRoad(situation.curvature_1pm)
     plans = []
+    name = f"{type(policy).__name__} in the check"
+    route = np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)])
     method = "reset"
     try:
-        policy.reset(
-            0, Route(np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)]))
-        )
+        with noted(PolicyError, name, defined(policy, method), runs_users_code(policy, method)):
+            policy.reset(0, Route(route))
         method = "act"
         for step, observation in enumerate(observations(situation, cameras)):
             began = time.perf_counter()
-            plans.append(policy.act(observation))
+            with noted(PolicyError, name, defined(policy, method), runs_users_code(policy, method)):
+                plans.append(policy.act(observation))
             if step:
                 durations_ms.append(1e3 * (time.perf_counter() - began))
     except SimrunError as error:
         return f"the policy failed: {error.message}"
-    except Exception as error:  # whatever a foreign policy raises is a result of the check
+    except BaseException as error:  # whatever a foreign policy raises is a result of the check
+        if is_interruption(error):
+            raise
         said = raised(error, defined(policy, method))
         return f"the policy raised in query {len(plans) + 1}: {said}"
     return plans

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from alpasim_plugin.cli.options import Json, typer_of
 from alpasim_plugin.cli.output import Progress, show
-from alpasim_plugin.cli.signals import Stopped
+from alpasim_plugin.core.errors import Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.drives.build import Report, import_drive
 from alpasim_plugin.drives.splat import import_splat

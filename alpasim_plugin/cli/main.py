@@ -12,6 +12,8 @@ import json
 import os
 import re
 import sys
+import threading
+import time
 import traceback
 from functools import cache
 from importlib import import_module
@@ -21,11 +23,20 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from alpasim_plugin.cli.signals import Stopped, leave_at_once, stoppable
-from alpasim_plugin.core.errors import InfrastructureError, InputError, InternalError, SimrunError
+from alpasim_plugin.cli.signals import leave_at_once, stoppable
+from alpasim_plugin.core.errors import (
+    InfrastructureError,
+    InputError,
+    InternalError,
+    SimrunError,
+    Stopped,
+    is_interruption,
+)
 from alpasim_plugin.core.files.places import damaged_kernels
 from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.printing import print_any_character, say, warn
+
+THREADS_S = 2.0  # for threads of parts, after the last line is printed
 
 # Panel of the help page -> verb -> module of this package and its function, and one line of help,
 # which is the first of the function's docstring.
@@ -335,7 +346,9 @@ def run_command(args: list[str]) -> int:
         return PIPE_CLOSED
     except (SimrunError, Stopped) as error:
         failure = error
-    except Exception as error:
+    except BaseException as error:  # an interrupt without a signal is some code's own
+        if is_interruption(error):
+            raise
         failure = _unforeseen(error, " ".join(["simrun", *args]))
         failure.__cause__ = error
     if "--debug" in args and isinstance(failure, SimrunError):
@@ -350,7 +363,7 @@ def run_command(args: list[str]) -> int:
     return failure.exit_code
 
 
-def _unforeseen(error: Exception, command: str) -> SimrunError:
+def _unforeseen(error: BaseException, command: str) -> SimrunError:
     """Return the error for what no part of the program has foreseen; a path that the system refuses
     is bad input.
     """
@@ -392,7 +405,26 @@ def main() -> None:
     print_any_character()
     if COMPLETION in os.environ:
         app(prog_name="simrun")
-    sys.exit(run_command(sys.argv[1:]))
+    code = run_command(sys.argv[1:])
+    _leave_threads_behind(code)
+    sys.exit(code)
+
+
+def _leave_threads_behind(code: int) -> None:
+    """End the process where a part has started a thread that is no daemon: Python would wait for it
+    without end.
+    """
+    others = [one for one in threading.enumerate() if one is not threading.main_thread()]
+    until_s = time.monotonic() + THREADS_S
+    for thread in others:
+        if not thread.daemon:
+            thread.join(max(until_s - time.monotonic(), 0.0))
+    if any(thread.is_alive() and not thread.daemon for thread in others):
+        from alpasim_plugin.alpasim.client.child import end_children  # only where a part ran
+
+        end_children()
+        _drop_unwritten_output()
+        os._exit(code)
 
 
 if __name__ == "__main__":

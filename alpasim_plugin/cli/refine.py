@@ -6,7 +6,7 @@ from typing import Annotated
 
 from alpasim_plugin.cli.options import Json, Overwrite, fixer_overrides
 from alpasim_plugin.cli.output import Progress, show, warn
-from alpasim_plugin.cli.signals import Stopped
+from alpasim_plugin.core.errors import Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.fixers import fixer_settings, make_fixer

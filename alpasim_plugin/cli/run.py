@@ -30,8 +30,7 @@ from alpasim_plugin.cli.output import (
     varied_lines,
     warn,
 )
-from alpasim_plugin.cli.signals import Stopped
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InputError, Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import split_names
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr

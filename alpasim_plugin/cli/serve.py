@@ -10,8 +10,7 @@ from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
 from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
 from alpasim_plugin.cli.output import show
-from alpasim_plugin.cli.signals import Stopped
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InputError, Stopped
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.json_types import JsonView

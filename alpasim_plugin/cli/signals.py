@@ -9,42 +9,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from alpasim_plugin.core.errors import Stopped
+
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-NOTHING_KEPT = "the same command starts again"
-
-
-class Stopped(BaseException):
-    """A signal asks the process to stop. No library takes it for an error of its own, since it is
-    no ``Exception``.
-
-    Attributes:
-        kept: What is kept and how to go on; whoever knows sets it on the way up.
-    """
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-        self.kept = ""
-
-    @property
-    def exit_code(self) -> int:
-        """Give the exit code of a process that a signal ended, as shells count it: 130, 143 or
-        129.
-        """
-        return 128 + self.number
-
-    def __str__(self) -> str:
-        return f"stopped by {signal.Signals(self.number).name}; {self.kept or NOTHING_KEPT}"
-
-    def as_dict(self) -> dict[str, str]:
-        """Return message, hint and class of an error, for ``--json``."""
-        return {
-            "message": f"stopped by {signal.Signals(self.number).name}",
-            "hint": self.kept or NOTHING_KEPT,
-            "failure_class": "stopped",
-        }
 
 
 @contextmanager

@@ -7,11 +7,14 @@ exit code agree.
 
 from __future__ import annotations
 
+import signal
 import traceback
 from collections.abc import Mapping
 from typing import ClassVar
 
 from alpasim_plugin.core.escape import shorten, terminal
+
+NOTHING_KEPT = "the same command starts again"
 
 
 class SimrunError(Exception):
@@ -106,6 +109,13 @@ class FixerError(InfrastructureError):
     failure_class: ClassVar[str] = "fixer"
 
 
+class FixerFault(FaultOfPart, FixerError):
+    """A fixer of the user's own raised, or broke its contract."""
+
+    exit_code: ClassVar[int] = 2
+    failure_class: ClassVar[str] = "fixer fault"
+
+
 class PolicyError(FaultOfPart):
     """A policy raised, or broke its contract: a fault of what is under test, not of the machine."""
 
@@ -120,9 +130,7 @@ class EvaluatorError(SimrunError):
 
 
 class InternalError(SimrunError):
-    """The program itself failed: an exception that nothing has foreseen, of ours or of a
-    plug-in.
-    """
+    """The program itself failed: an exception that nothing has foreseen."""
 
     exit_code: ClassVar[int] = 70
     failure_class: ClassVar[str] = "internal"
@@ -141,3 +149,44 @@ class InternalError(SimrunError):
             "run the command with --debug and report the traceback to whoever maintains that file"
         )
         return cls(f"{command}: {type(error).__name__}: {error}{where}", do_this)
+
+
+class Stopped(BaseException):
+    """A signal asks the process to stop. No library takes it for an error of its own, since it is
+    no ``Exception``.
+
+    Attributes:
+        kept: What is kept and how to go on; whoever knows sets it on the way up.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+        self.kept = ""
+
+    @property
+    def exit_code(self) -> int:
+        """Give the exit code of a process that a signal ended, as shells count it: 130, 143 or
+        129.
+        """
+        return 128 + self.number
+
+    def __str__(self) -> str:
+        return f"stopped by {signal.Signals(self.number).name}; {self.kept or NOTHING_KEPT}"
+
+    def as_dict(self) -> dict[str, str]:
+        """Return message, hint and class of an error, for ``--json``."""
+        return {
+            "message": f"stopped by {signal.Signals(self.number).name}",
+            "hint": self.kept or NOTHING_KEPT,
+            "failure_class": "stopped",
+        }
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Tell whether a signal that this process received has raised an error: the command line
+    raises `Stopped`, and Python's own handler ``KeyboardInterrupt``.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        return signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return isinstance(error, Stopped)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, TypeVar, cast
 
@@ -352,6 +352,27 @@ def read_only(record: RecordT) -> RecordT:
     copy = object.__new__(type(record))
     vars(copy).update(vars(record) | views)
     return copy
+
+
+def shielded(value: Any) -> Any:
+    """Return data for code that is not ours: all arrays in it are views that cannot be written, and
+    records and mappings are copies, so that nothing that is done to them reaches ours.
+    """
+    if isinstance(value, np.ndarray):
+        view = value.view()
+        view.flags.writeable = False
+        return view
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(shielded, value))
+    if isinstance(value, tuple | list):
+        return type(value)(map(shielded, value))
+    if isinstance(value, dict):
+        return {key: shielded(one) for key, one in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        copy = object.__new__(type(value))
+        vars(copy).update({name: shielded(one) for name, one in vars(value).items()})
+        return copy
+    return value
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,21 @@ import numpy as np
 
 from alpasim_plugin.cameras.lens import blackened
 from alpasim_plugin.cameras.lens_cover import LensCover
-from alpasim_plugin.core.errors import FixerError, InputError, SimrunError
+from alpasim_plugin.core.errors import FixerError, FixerFault, InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
 from alpasim_plugin.core.parts import complete
+from alpasim_plugin.core.parts.blame import blaming, defined, is_own
 from alpasim_plugin.core.parts.spec import MODES
-from alpasim_plugin.core.types import U8, Actor, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import (
+    U8,
+    Actor,
+    Frame,
+    RecordedFrame,
+    RenderRequest,
+    Scenario,
+    read_only,
+)
 from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
@@ -127,20 +136,15 @@ class BlockRunner:
         frames = [item.frame for item in block]
         maps = [item.map for item in block if item.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
-        with self._timed("fix"):
-            try:
-                fixed = list(call(frames, maps))
-            except SimrunError:
-                raise
-            except Exception as error:
-                raise FixerError(
-                    f"{name}: {type(error).__name__}: {error}",
-                    "see the traceback in the rollout's manifest",
-                ) from error
-        problem = _problem(frames, fixed)
+        kind = FixerError if is_own(fixer) else FixerFault
+        where = defined(fixer, "step")
+        shown = frames if is_own(fixer) else [read_only(frame) for frame in frames]
+        with self._timed("fix"), blaming(kind, name, where, not is_own(fixer)):
+            fixed = list(call(shown, maps))
+            problem = _problem(frames, fixed)
         if problem:
-            raise FixerError(
-                f"{name}: {problem}",
+            raise kind(
+                f"{name}: {problem}{where}",
                 "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
             )
         out = []

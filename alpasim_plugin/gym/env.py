@@ -53,7 +53,9 @@ class Controls:
     """``(2,)`` in -1..1: steering angle of the wheels as a share of the vehicle's limit, left
     positive; throttle above 0, brake below.
 
-    The vehicle's own limits apply, its steering rate too. The brake ends at a standstill.
+    The vehicle's own limits apply, its steering rate too. The brake ends at a standstill. The
+    command is held from the instant at which a plan made now would be followed: after the
+    scenario's latency.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -64,7 +66,7 @@ class Controls:
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Hold the command, and return where it leads in two seconds."""
         steer, pedal = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
-        self.controller.command = Command(
+        command = self.controller.commands[observation.t_us] = Command(
             float(steer) * self._vehicle.max_steer_rad,
             float(max(pedal, 0.0) * self._vehicle.max_accel_mps2),
             float(max(-pedal, 0.0) * self._vehicle.max_brake_mps2),
@@ -73,22 +75,31 @@ class Controls:
         step_s = PREDICTED_STEP_US * 1e-6
         states = [replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)]
         for _ in times[1:]:
-            states.append(step(states[-1], self.controller.command, step_s, self._vehicle, step_s))
+            states.append(step(states[-1], command, step_s, self._vehicle, step_s))
         rows = np.array([(one.x_m, one.y_m, one.yaw_rad) for one in states])
         return Plan(observation.t_us, times, rows[:, :2], rows[:, 2])
 
 
 class HeldCommand(Controller):
-    """A kinematic bicycle under a command that its owner holds; it follows no plan."""
+    """A kinematic bicycle under commands: of a plan it takes when it was made, and holds the command
+    of that instant; none, straight on at its speed, where there is no such command.
+
+    Attributes:
+        commands: By the time of the query that they answered.
+    """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self.command = Command(0.0)
+        self.commands: dict[int, Command] = {}
 
     def advance(self, state: EgoState, plan: Trajectory | None, to_us: int) -> EgoState:
         """Return the state at ``to_us``; see `Controller.advance`."""
         dt_s = check_interval(state, to_us)
-        after = step(planar(state), self.command, dt_s, self._vehicle)
+        made_us = None if plan is None else int(plan.t_us[0])
+        command = Command(0.0)
+        if made_us is not None:
+            command = self.commands.get(made_us, command)
+        after = step(planar(state), command, dt_s, self._vehicle)
         z_m = float(state.T_world_rig[2, 3])
         accel = (after.speed_mps - state.speed_mps) / dt_s
         return spatial(after, to_us, z_m, accel, self._vehicle)
@@ -248,6 +259,8 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         loop = Loop(scenario, session, self._sensors, self._actions.controller, recorder)
         driving = loop.drive()
         scorer = Scorer(scenario, self._preset, self._reward)
+        if isinstance(self._actions, Controls):
+            self._actions.controller.commands.clear()
         self._episode = _Episode(folder, recorder, loop, driving, scorer)
         self._over = False
         observation = next(driving)

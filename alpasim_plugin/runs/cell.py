@@ -1,5 +1,7 @@
 """One cell of a run: build its parts, drive, score, write. Runs in a worker process."""
 
+import errno
+import json
 import os
 import shutil
 import time
@@ -9,11 +11,20 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 
 from alpasim_plugin.control import Controller
-from alpasim_plugin.core.errors import FaultOfPart, InfrastructureError, SimrunError
+from alpasim_plugin.core.errors import (
+    FaultOfPart,
+    InfrastructureError,
+    InputError,
+    PolicyError,
+    RendererFault,
+    SimrunError,
+    is_interruption,
+)
 from alpasim_plugin.core.files import content_of, places, real, some_of
 from alpasim_plugin.core.files.atomic import disk_error
 from alpasim_plugin.core.files.inputs import Inputs
@@ -21,6 +32,8 @@ from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import RendererSpec, build, complete
+from alpasim_plugin.core.parts.blame import last_called
+from alpasim_plugin.core.parts.patches import replaced_code
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.asl import copy_log
@@ -46,6 +59,7 @@ from alpasim_plugin.log.run_folder.writer import copy_steps, write_steps
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.changes import changed_inputs
 from alpasim_plugin.runs.film import write_film
+from alpasim_plugin.runs.guards import calling
 from alpasim_plugin.runs.plan import Cell, RunOptions
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.renderer import make_renderer
@@ -134,13 +148,15 @@ def run_cell(
     with _writing_manifest(cell, options, folder) as manifest:
         planned = _scenario(cell) if load is None else load(cell.ref)
         scenario = replace(planned, stop_at_path_end=cell.stops_at_path_end)
-        with parts_print_to_stderr(folder / OUTPUT_NAME), Inputs() as inputs:
+        with parts_print_to_stderr(folder / OUTPUT_NAME), _same_folder(), Inputs() as inputs:
             parts = builder(cell, options, scenario, threads)
             announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
+        require_same_code()
         manifest["inputs"] = _not_planned(inputs, cell, scenario, root)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
         manifest |= _score(folder, cell, options, scenario)
+        require_same_code()
         if _wants_film(options.video, manifest):
             recorder.film.save(folder)
             if not manifest["has_camera"]:
@@ -229,12 +245,24 @@ def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator
             (folder / name).unlink(missing_ok=True)
         yield manifest
         manifest["status"] = "ok"
-    except Exception as error:
+    except BaseException as error:
+        if is_interruption(error):
+            raise
         manifest.pop("metrics", None)  # a film that failed leaves a rollout without values
         manifest |= _failure(error, folder)
         _log_traceback(error, folder)
     manifest["wall_s"] = round(time.perf_counter() - began, 4)
     write_manifest(folder, manifest)
+
+
+@contextmanager
+def _same_folder() -> Iterator[None]:
+    """Return to the working folder after the block: a part may have left it."""
+    folder = os.getcwd()
+    try:
+        yield
+    finally:
+        os.chdir(folder)
 
 
 def _wants_film(video: str, manifest: JsonView) -> bool:
@@ -283,8 +311,10 @@ def _facts_of(parts: RolloutParts, has_fixer: bool) -> JsonObject:
     """Return what renderer and policy say of the rollout; a renderer with a fixer speaks for the
     fixer.
     """
-    rendered = dict(complete(parts.renderer, Renderer).facts())
-    driven = dict(complete(parts.policy, Policy).facts())
+    with calling(parts.renderer, "facts", RendererFault):
+        rendered = stored(complete(parts.renderer, Renderer).facts())
+    with calling(parts.policy, "facts", PolicyError):
+        driven = stored(complete(parts.policy, Policy).facts())
     has_camera = bool(complete(parts.policy, Policy).sensors)
     facts: JsonObject = {"fixer": rendered if has_fixer else {}, "has_camera": has_camera}
     if rendered and not has_fixer:
@@ -294,11 +324,37 @@ def _facts_of(parts: RolloutParts, has_fixer: bool) -> JsonObject:
     return facts
 
 
-def _failure(error: Exception, folder: Path) -> JsonObject:
+def stored(facts: Mapping[str, Any]) -> JsonObject:
+    """Return what a part says of itself, as JSON holds it; raises where it does not."""
+    values: JsonObject = json.loads(json.dumps(dict(facts)))
+    return values
+
+
+def require_same_code() -> None:
+    """Refuse a rollout in which a part of the user's has replaced code of a library or of simrun.
+
+    Raises:
+        SimrunError: Of the part that was called last.
+    """
+    culprit = last_called()
+    replaced = "" if culprit is None else replaced_code()
+    if culprit is not None and replaced:
+        raise culprit.error(f"{replaced} was replaced by a part of this rollout")
+
+
+def _failure(error: BaseException, folder: Path) -> JsonObject:
     """Return what the manifest says of a rollout that failed; called where the error is handled."""
     facts: JsonObject = {"status": "failed", "traceback": traceback.format_exc()}
-    if isinstance(error, OSError):
+    culprit = last_called()
+    if isinstance(error, OSError) and error.errno == errno.EBADF and culprit is not None:
+        error = culprit.error("it closed files of its process")
+    elif isinstance(error, OSError):
         error = disk_error(folder, error)
+    elif not isinstance(error, SimrunError):
+        try:
+            require_same_code()
+        except SimrunError as fault:
+            error = fault
     if isinstance(error, SimrunError):
         facts["final"] = isinstance(error, FaultOfPart) and error.is_final
         return facts | {"error": error.as_dict()}
@@ -311,12 +367,12 @@ def _failure(error: Exception, folder: Path) -> JsonObject:
     }
 
 
-def _log_traceback(error: Exception, folder: Path) -> None:
+def _log_traceback(error: BaseException, folder: Path) -> None:
     """Add the traceback of what failed first to the log of the rollout, which the terminal names;
     not of an error of ours, whose text says all.
     """
     cause = error
-    while isinstance(cause.__cause__, Exception):
+    while cause.__cause__ is not None:
         cause = cause.__cause__
     if isinstance(cause, SimrunError):
         return
@@ -326,6 +382,16 @@ def _log_traceback(error: Exception, folder: Path) -> None:
         (folder / OUTPUT_NAME).open("a", encoding="utf-8") as log,
     ):  # the disk may be what failed; the manifest has it too
         log.write(text)
+
+
+def users_parts(cell: Cell) -> str:
+    """Name the parts of the user's that a rollout calls; empty where all are simrun's."""
+    renderer = cell.renderer
+    called = [cell.policy, cell.controller, renderer.base, renderer.fixer]
+    names = [part.name for part in called if part is not None and part.is_users]
+    if any(part.is_users for part in cell.evaluators):
+        names.append(cell.folder.as_posix())  # an evaluator must change no other rollout
+    return ", ".join(names)
 
 
 def failed_manifest(cell: Cell, error: SimrunError) -> JsonObject:
@@ -405,13 +471,15 @@ def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) ->
 @contextmanager
 def _closing(part: Policy | Controller) -> Iterator[None]:
     """Close a part after its rollout."""
+    kind = PolicyError if isinstance(part, Policy) else InputError
     try:
         yield
     except BaseException:
-        with suppress(SimrunError):  # what failed first is the rollout's failure
-            part.close()
+        with suppress(SimrunError), calling(part, "close", kind):
+            part.close()  # what failed first is the rollout's failure
         raise
-    part.close()
+    with calling(part, "close", kind):
+        part.close()
 
 
 def _scenario(cell: Cell) -> Scenario:

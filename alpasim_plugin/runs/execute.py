@@ -8,13 +8,14 @@ therefore run rollouts in any order.
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 from alpasim_plugin.core.devices import share_card
-from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.files.stage import shown_in
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.manifests import write_manifest
@@ -27,13 +28,16 @@ from alpasim_plugin.runs.cell import (
     kept_failure,
     rescore_cell,
     run_cell,
+    users_parts,
 )
 from alpasim_plugin.runs.changes import reasons, sentence
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
-from alpasim_plugin.runs.local_executor import Lost, run_jobs
+from alpasim_plugin.runs.local_executor import Lost, apart, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
 NOTHING: JsonView = {}
+NOT_DRIVEN = "Correct the policy; it was not driven."
+
 OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
 Job = tuple[Cell, JsonObject | None]  # with the manifest of the rollout that it is a copy of
 Done = Iterator[tuple[Cell, JsonObject]]
@@ -106,6 +110,7 @@ def execute(
     on_done: OnDone,
     notify: Callable[[str], None],
     held: JsonView = NOTHING,
+    hanging: Mapping[str, str] = MappingProxyType({}),
 ) -> list[JsonObject]:
     """Run every unfinished rollout and return all manifests in the plan's order.
 
@@ -122,6 +127,7 @@ def execute(
         notify: Called with one line for each damaged rollout, one that says what is driven again and
             why, and one for each failure that is kept.
         held: What ``run.json`` said before; it names the files of what is driven again.
+        hanging: By policy what its check says, where it hung or died: such a policy is not driven.
     """
     manifests: dict[Path, JsonObject] = {}
     todo = []
@@ -143,6 +149,11 @@ def execute(
                 copies.append((cell, original))
                 continue
         if action == "drive" or state.manifest is None:
+            if cell.policy.name in hanging:
+                error = PolicyError(hanging[cell.policy.name], NOT_DRIVEN)
+                manifests[cell.folder] = _write_failed(cell, root, error)
+                on_done(manifests[cell.folder], False)
+                continue
             todo.append(cell)
             why = [] if state.manifest is None else reasons(cell, state.manifest, held, plan)
             n_again += bool(why)
@@ -152,7 +163,7 @@ def execute(
         if manifest["status"] != "ok":
             notify(kept_failure(cell, manifest))
         if action == "score":
-            manifest = rescore_cell(cell, plan.options, root, manifest)
+            manifest = _rescored(cell, plan, root, manifest, how)
         manifests[cell.folder] = manifest
         on_done(manifest, True)
 
@@ -174,6 +185,18 @@ def execute(
     return [manifests[cell.folder] for cell in plan.cells]
 
 
+def _rescored(
+    cell: Cell, plan: RunPlan, root: Path, manifest: JsonObject, how: HowToRun
+) -> JsonObject:
+    """Score a rollout again; where an evaluator fails, its log and its values stay on disk."""
+    parts = ", ".join(part.name for part in cell.evaluators if part.is_users)
+    work = partial(rescore_cell, options=plan.options, root=root.absolute(), manifest=manifest)
+    try:
+        return apart(work, cell, parts, how.here.per_worker, how.limit_s)
+    except SimrunError as error:
+        return failed_manifest(cell, error)
+
+
 def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Drive rollouts where the executor says; with Ray only this process writes the run folder."""
     if how.executor.is_local:
@@ -192,15 +215,20 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
     threads = how.here.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
-    work = partial(_work, plan.options, root, how.here)
+    work = partial(_work, plan.options, root.absolute(), how.here)
 
     def written(job: Job) -> JsonObject | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
         action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    for (cell, _), result in run_jobs(work, jobs, workers, threads, how.limit_s, written):
+    driven = run_jobs(work, jobs, workers, threads, how.limit_s, written, _users_parts)
+    for (cell, _), result in driven:
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
+
+
+def _users_parts(job: Job) -> str:
+    return users_parts(job[0])
 
 
 def _work(options: RunOptions, root: Path, here: Threads, job: Job) -> JsonObject:
@@ -218,7 +246,10 @@ def _lost(cell: Cell, root: Path, lost: Lost) -> JsonObject:
     """Write the manifest of a rollout whose workers died, or that was ended since it took too
     long.
     """
-    error = InfrastructureError(f"{cell.folder.as_posix()}: {lost.reason}", lost.hint)
+    return _write_failed(cell, root, lost.error(cell.folder.as_posix()))
+
+
+def _write_failed(cell: Cell, root: Path, error: SimrunError) -> JsonObject:
     manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

@@ -14,14 +14,15 @@ instant are discarded.
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
+from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.interfaces import Controller, Policy, Renderer, complete
 from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.core.types import (
     EgoState,
@@ -38,8 +39,15 @@ from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifes
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 from alpasim_plugin.log.trace import first_difference
-from alpasim_plugin.runs.cell import RolloutParts, build_parts, run_cell
+from alpasim_plugin.runs.cell import (
+    RolloutParts,
+    build_parts,
+    failed_manifest,
+    run_cell,
+    users_parts,
+)
 from alpasim_plugin.runs.execute import thread_budget
+from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.logged_rollout import LoggedRollout
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
 from alpasim_plugin.runs.repeat import log_trace
@@ -99,7 +107,10 @@ class SwitchedPolicy(Policy):
     def __init__(
         self, first: Policy, then: Policy, at_us: int, then_seed: int, scenario: Scenario
     ) -> None:
-        self.first, self.then, self.at_us, self.then_seed = first, then, at_us, then_seed
+        self.first = complete(first, Policy)
+        self.then = complete(then, Policy)
+        self.at_us = at_us
+        self.then_seed = then_seed
         self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, scenario)
 
     def reset(self, seed: int, route: Route) -> None:
@@ -115,6 +126,25 @@ class SwitchedPolicy(Policy):
         if early and self.then is not self.first:
             self.then.act(observation)
         return plan
+
+    def end(self, frames: Mapping[str, Frame]) -> None:
+        """End the rollout of both."""
+        for policy in self._both:
+            policy.end(frames)
+
+    def close(self) -> None:
+        """Close both, the second one also where the first one fails."""
+        with ExitStack() as stack:
+            for policy in self._both:
+                stack.callback(policy.close)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts of the second policy, or of the first if the second has none."""
+        return dict(self.then.facts() or self.first.facts())
+
+    @property
+    def _both(self) -> tuple[Policy, ...]:
+        return (self.first,) if self.then is self.first else (self.first, self.then)
 
 
 class SwitchedController(Controller):
@@ -174,15 +204,23 @@ class Change:
         ]
         return f"{', '.join(part for part in parts if part)} from {self.after_us * 1e-6:g} s"
 
-    def apply(self, cell: Cell, fixer: Sequence[str]) -> Cell:
-        """Return the rollout with the replaced parts; ``fixer`` are the run's fixer settings."""
+    def apply(self, cell: Cell, options: RunOptions) -> Cell:
+        """Return the rollout with the replaced parts.
+
+        A new policy brings its own controller, unless the run named one for all of its policies.
+
+        Args:
+            cell: The logged rollout.
+            options: Of its run.
+        """
+        fixer = options.fixer
         renderer = (
             cell.renderer if self.renderer is None else resolve_renderer(self.renderer, fixer)
         )
         policy = cell.policy if self.policy is None else resolve("policy", self.policy)
-        controller = (
-            cell.controller if self.policy is None else resolve("controller", policy.controller)
-        )
+        controller = cell.controller
+        if self.policy is not None and not options.controller:
+            controller = resolve("controller", policy.controller)
         return replace(
             cell,
             renderer=renderer,
@@ -234,7 +272,7 @@ def fork_rollout(
 def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str]) -> RunResult:
     began = time.perf_counter()
     options = replace(past.options, baseline=past.cell.renderer.name)
-    then = change.apply(past.cell, options.fixer)
+    then = change.apply(past.cell, options)
     # Copy the original rollout's folder and return its manifest.
     folder = root / past.cell.folder
     shutil.copytree(past.folder, folder, dirs_exist_ok=True)
@@ -258,9 +296,19 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     )
     threads = thread_budget(1, 1)
     at_us = past.scenario.start_us + change.after_us
-    manifest = run_cell(
-        fork, options, root, threads.per_worker, partial(_parts, past.cell, then, change)
+    work = partial(
+        run_cell,
+        options=options,
+        root=root.absolute(),
+        threads=threads.per_worker,
+        builder=partial(_parts, past.cell, then, change),
     )
+    parts = users_parts(past.cell) or users_parts(then)
+    try:
+        manifest = apart(work, fork, parts, threads.per_worker)
+    except SimrunError as error:
+        manifest = failed_manifest(fork, error)
+        write_manifest(root / fork.folder, manifest)
     if manifest["status"] == "ok":
         _check_replay(past, at_us, root / fork.folder)
         manifest["fork"] = asdict(change) | {"of": past.name, "replay": "equal"}

@@ -1,15 +1,16 @@
 """Checks of what renderers and policies return; an error names the part that broke its contract."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault
+from alpasim_plugin.core.errors import PolicyError, RendererError, RendererFault, SimrunError
 from alpasim_plugin.core.image_metrics import is_black
 from alpasim_plugin.core.interfaces import Policy, Renderer
-from alpasim_plugin.core.parts.blame import blaming, defined, is_own
+from alpasim_plugin.core.parts.blame import blaming, defined, is_own, runs_users_code
 from alpasim_plugin.core.plan_check import plan_problem, sensors_problem
 from alpasim_plugin.core.types import (
     Frame,
@@ -24,6 +25,18 @@ from alpasim_plugin.core.types import (
 ALPHA, DEPTH_M = 1.0, 1e6  # largest values of a frame's planes
 ROUNDING = 1e-3
 CHECK = "simrun check policy finds all faults of a policy"
+
+
+def calling(part: object, method: str, kind: type[SimrunError]) -> AbstractContextManager[None]:
+    """Return a context in which a part is blamed for what its method raises.
+
+    Args:
+        part: The part.
+        method: Which of its methods is called.
+        kind: Its error.
+    """
+    name = type(part).__name__
+    return blaming(kind, f"{name}.{method}", defined(part, method), runs_users_code(part, method))
 
 
 def checked_frames(
@@ -41,8 +54,11 @@ def checked_frames(
     kind = RendererError if is_own(renderer) else RendererFault
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
     where = defined(renderer, "render")
-    with blaming(kind, name, where):
-        frames = list(renderer.render_batch(requests))
+    shown = requests
+    if not is_own(renderer):
+        shown = [replace(read_only(one), camera=read_only(one.camera)) for one in requests]
+    with blaming(kind, name, where, not is_own(renderer)):
+        frames = list(renderer.render_batch(shown))
     problem = f"{len(frames)} frames for {len(requests)} requests"
     if len(frames) == len(requests):
         problem = "; ".join(filter(None, map(_frame_problem, frames, requests)))
@@ -103,10 +119,13 @@ def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
     Raises:
         PolicyError: They are not a sequence of `SensorSpec`.
     """
-    found = sensors_problem(policy.sensors)
+    name = type(policy).__name__
+    with blaming(PolicyError, f"{name}, its sensors", "", runs_users_code(policy, "act")):
+        sensors = policy.sensors
+        found = sensors_problem(sensors)
     if found:
-        raise PolicyError(f"{type(policy).__name__}: {found}", CHECK)
-    return policy.sensors
+        raise PolicyError(f"{name}: {found}", CHECK)
+    return sensors
 
 
 def reset_policy(policy: Policy, seed: int, route: Route) -> None:
@@ -115,7 +134,7 @@ def reset_policy(policy: Policy, seed: int, route: Route) -> None:
     Raises:
         PolicyError: The policy raised.
     """
-    with blaming(PolicyError, type(policy).__name__, defined(policy, "reset")):
+    with calling(policy, "reset", PolicyError):
         policy.reset(seed, read_only(route))
 
 
@@ -128,9 +147,9 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
     where = defined(policy, "act")
-    with blaming(PolicyError, name, where):
+    with blaming(PolicyError, name, where, runs_users_code(policy, "act")):
         plan = policy.act(observation)
-    found = plan_problem(plan, observation.t_us)
+        found = plan_problem(plan, observation.t_us)
     if found:
         raise PolicyError(f"{name}: {found}{where}", CHECK)
     return plan

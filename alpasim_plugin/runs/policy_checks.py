@@ -21,7 +21,9 @@ from policies.base import make_policy
 from policies.conformance import check_policy
 
 LIMIT_S = 120.0
-NEVER_DRIVES = ("made", "sensors")  # breaches that no rollout survives
+HANGS = "hangs"
+HUNG_SHARE = 0.5  # of the time limit, in one call
+NEVER_DRIVES = ("made", "sensors", HANGS)  # breaches that no rollout survives
 
 
 def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
@@ -83,14 +85,13 @@ def check_policies(
         elif policy.address is None:
             todo.append(policy)
     workers = min(how.threads.workers, len(todo))
-    limit_s = how.limit_s if how.threads.workers == 1 else how.limit_s or LIMIT_S
+    limit_s = how.limit_s or LIMIT_S
     check = partial(_check, scenarios)
-    for policy, result in run_jobs(check, todo, workers, how.threads.per_worker, limit_s):
+    threads = how.threads.per_worker
+    checked = run_jobs(check, todo, workers, threads, limit_s, parts_of=lambda policy: policy.name)
+    for policy, result in checked:
         if isinstance(result, Lost):
-            result = {
-                "breaches": [["ends", f"the check did not end: {result.reason}"]],
-                "notes": [],
-            }
+            result = _of_lost(result, limit_s)
         if isinstance(result, InputError):
             raise result
         found[policy.name] = {"digest": policy.digest, **result}
@@ -103,6 +104,30 @@ def check_policies(
         for _, sentence in found[policy.name]["breaches"]:
             noticed(f"check of {policy.name}: {sentence}")
     return found
+
+
+def hanging(checks: JsonView) -> dict[str, str]:
+    """Return by policy what `check_policies` found, where it hung in the check or ended its
+    process: what would drive it would hang, or end, as well.
+    """
+    return {
+        policy: sentence
+        for policy, found in checks.items()
+        for name, sentence in found["breaches"]
+        if name == HANGS
+    }
+
+
+def _of_lost(lost: Lost, limit_s: float | None) -> JsonObject:
+    """Return what the check of a policy found whose process was lost."""
+    sentence = f"the check did not end: {lost.reason}"
+    name = "ends"
+    culprit = lost.culprit
+    if culprit is not None:
+        sentence = culprit.error(lost.reason).message
+        is_slow = lost.is_late and lost.hung_s < HUNG_SHARE * (limit_s or LIMIT_S)
+        name = name if is_slow else HANGS
+    return {"breaches": [[name, sentence]], "notes": []}
 
 
 def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> JsonObject | InputError:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from functools import partial
 
 from alpasim_plugin.cameras.lens_cover import LensCover
+from alpasim_plugin.core.errors import RendererFault
 from alpasim_plugin.core.files.places import require_kernels
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import RendererSpec, build, resolve_renderer
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.guards import calling, checked_frames
 from alpasim_plugin.runs.lenses import LensRenderer
 
 
@@ -57,7 +58,8 @@ def make_renderer(
     settings = spec.fixer.settings
     assert isinstance(settings, FixerSettings), "the settings of a fixer derive from FixerSettings"
 
-    recorded = base.recorded() if settings.references else ()
+    with calling(base, "recorded", RendererFault):
+        recorded = base.recorded() if settings.references else ()
     return fixed_renderer(
         partial(checked_frames, base, on_device=True),
         lambda: build(fixer, scene_id=scenario.scene_id, **session),

@@ -1,15 +1,18 @@
 """Drive a rollout of each policy a second time, to see whether it is repeatable."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.files.atomic import scratch_folder
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
 from alpasim_plugin.log.trace import Trace, first_difference, trace_log
-from alpasim_plugin.runs.cell import run_cell
+from alpasim_plugin.runs.cell import run_cell, users_parts
+from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.plan import Cell, RunPlan
 
 
@@ -59,7 +62,11 @@ def repeat_rollout(
 def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonObject:
     folder = root / cell.folder
     with scratch_folder(root / "repeat") as scratch:
-        again = run_cell(cell, plan.options, scratch, threads)
+        work = partial(run_cell, options=plan.options, root=scratch.absolute(), threads=threads)
+        try:
+            again = apart(work, cell, users_parts(cell), threads)
+        except SimrunError as error:
+            return _not_compared(f"the second rollout failed: {error.message}")
         if again["status"] != "ok":
             return _not_compared(f"the second rollout failed: {again['error']['message']}")
         first = log_trace(folder)

@@ -7,11 +7,18 @@ from collections.abc import Generator, Mapping, Sequence
 
 from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.clock import Clock
+from alpasim_plugin.core.errors import PolicyError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.core.parts import complete
 from alpasim_plugin.core.types import F64, Observation, Plan, Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig, make_cadence
-from alpasim_plugin.runs.guards import checked_frames, checked_plan, checked_sensors, reset_policy
+from alpasim_plugin.runs.guards import (
+    calling,
+    checked_frames,
+    checked_plan,
+    checked_sensors,
+    reset_policy,
+)
 from alpasim_plugin.runs.loop_state import Forecaster, LoopState, PathEnd, PlanQueue
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.world.actors import make_actors
@@ -57,7 +64,8 @@ def run_rollout(
             observation = driving.send(checked_plan(policy, observation))
     except StopIteration:  # the rollout has ended
         pass
-    policy.end(dict(loop.state.frames))
+    with calling(policy, "end", PolicyError):
+        policy.end(dict(loop.state.frames))
     recorder.finish(loop.path_end)
     return recorder
 

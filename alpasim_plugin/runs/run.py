@@ -36,7 +36,7 @@ from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.plan import RunPlan
-from alpasim_plugin.runs.policy_checks import check_policies
+from alpasim_plugin.runs.policy_checks import check_policies, hanging
 from alpasim_plugin.runs.provenance import hardware, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
@@ -197,7 +197,9 @@ def execute_run(
         known = held.get("policy_checks") or {}
         try:
             checks = check_policies(plan, known, how, progress.noticed)
-            manifests = execute(plan, root, how, on_done(progress), progress.noticed, held)
+            manifests = execute(
+                plan, root, how, on_done(progress), progress.noticed, held, hanging(checks)
+            )
             wall_s = time.perf_counter() - began
             more: JsonObject = {
                 "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))},

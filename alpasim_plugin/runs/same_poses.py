@@ -4,6 +4,7 @@ import base64
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
 from alpasim_plugin.runs.cameras import logged_request
 from alpasim_plugin.runs.guards import checked_frames
+from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.plan import Cell, RunPlan
 from alpasim_plugin.runs.renderer import make_renderer
 from evaluators.metrics.outcomes import first_failure
@@ -47,10 +49,14 @@ def store_same_poses(
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
         failed_us = int((first_failure(manifest) or {})["t_us"])
-        shown = {}
+        shown: dict[str, list[tuple[int, str]]] = {}
         for spec in plan.renderers:
             if spec.name != cell.renderer.name:
-                shown[spec.name] = _images(plan, cell, spec, log, failed_us, threads)
+                users = [part for part in (spec.base, spec.fixer) if part and part.is_users]
+                work = partial(_images, plan, cell, log=log, failed_us=failed_us, threads=threads)
+                shown[spec.name] = []
+                with suppress(SimrunError):  # its own rollouts show the error
+                    shown[spec.name] = apart(work, spec, spec.name if users else "", threads)
         images = {name: images for name, images in shown.items() if images}
         write_json(path, {"key": key, "images": images})
 
@@ -100,13 +106,10 @@ def _images(
     if not until:
         return []  # the policy has no camera, or the log no images
     images = []
-    try:
-        renderer = make_renderer(spec, scenario, cell.seed, plan.options.device, threads)
-        for image in until[-FRAMES:] if renderer.block is None else ():
-            request = logged_request(log, cameras[image.camera], image.end_us)
-            frame = checked_frames(renderer, [request])[0]
-            data = encode_image(smaller(frame.rgb, WIDTH_PX), "jpeg", 85)
-            images.append((image.end_us, base64.b64encode(data).decode()))
-    except SimrunError:
-        return []  # its own rollouts show the error
+    renderer = make_renderer(spec, scenario, cell.seed, plan.options.device, threads)
+    for image in until[-FRAMES:] if renderer.block is None else ():
+        request = logged_request(log, cameras[image.camera], image.end_us)
+        frame = checked_frames(renderer, [request])[0]
+        data = encode_image(smaller(frame.rgb, WIDTH_PX), "jpeg", 85)
+        images.append((image.end_us, base64.b64encode(data).decode()))
     return images

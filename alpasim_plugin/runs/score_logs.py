@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
@@ -16,12 +17,13 @@ from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, require_installed
-from alpasim_plugin.core.types import RolloutLog, Scenario, Scene
+from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
+from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.scoring import tabulate
@@ -163,8 +165,12 @@ def _score(
         preset = replace(preset, image_camera=None)  # our runs name their cameras as they like
     try:
         check_complete(log, rollout)
-        series = tuple(score(rollout, scene, preset, evaluators))
-        rows, facts = tabulate(rollout, series, preset)
+        parts = ", ".join(part.name for part in evaluators if part.is_users)
+        if parts:
+            work = partial(_values_of_log, preset=preset, evaluators=evaluators)
+            series, rows, facts = apart(work, (log, scene), parts, 1)
+        else:
+            series, rows, facts = _values(rollout, scene, preset, evaluators)
     except SimrunError as error:
         return _failed(manifest, error, root, taken)
     manifest |= {"status": "ok", "path": _folder(manifest, taken)} | facts
@@ -174,6 +180,25 @@ def _score(
     return LogScore(
         manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name)
     )
+
+
+Values = tuple[tuple[MetricSeries, ...], list[JsonObject], JsonObject]
+
+
+def _values_of_log(
+    log_and_scene: tuple[Path, Scene], preset: Preset, evaluators: Sequence[PartSpec]
+) -> Values:
+    """Return what `_values` does, in a process of its own."""
+    log, scene = log_and_scene
+    return _values(read_asl(log), scene, preset, evaluators)
+
+
+def _values(
+    rollout: RolloutLog, scene: Scene, preset: Preset, evaluators: Sequence[PartSpec]
+) -> Values:
+    """Return the series of a log, and the rows and facts that `tabulate` makes of them."""
+    series = tuple(score(rollout, scene, preset, evaluators))
+    return series, *tabulate(rollout, series, preset)
 
 
 def check_vouched(log: Path) -> None:

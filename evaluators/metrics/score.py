@@ -10,11 +10,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.errors import EvaluatorError, SimrunError
+from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.interfaces import Evaluator
 from alpasim_plugin.core.parts import PartSpec, build, names, resolve
+from alpasim_plugin.core.parts.blame import blaming, defined, is_own
 from alpasim_plugin.core.parts.registry import entries
-from alpasim_plugin.core.types import I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import (
+    I64,
+    Bool,
+    MetricSeries,
+    RolloutLog,
+    Scene,
+    Trajectory,
+    shielded,
+)
 from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.table import METRICS, MetricTable, table_of
@@ -96,18 +105,16 @@ def run_evaluator(
         EvaluatorError: It failed, gave a metric that the table does not hold, or series of unlike
             lengths; it is named.
     """
-    try:
+    called = defined(evaluator, "__call__")
+    what = f"evaluator {name!r}, scene {rollout.scene_id!r}"
+    if not is_own(evaluator):  # the next one must see the same
+        rollout = shielded(rollout)
+        scene = shielded(scene)
+    with blaming(EvaluatorError, what, called, not is_own(evaluator)):
         answer = [
             replace(metric_series, metric=known.info(metric_series.name))
             for metric_series in evaluator(rollout, scene)
         ]
-    except SimrunError:
-        raise
-    except Exception as exc:  # third-party code: the cause is chained, nothing is swallowed
-        raise EvaluatorError(
-            f"evaluator {name!r}, scene {rollout.scene_id!r}: {type(exc).__name__}: {exc}",
-            "run with --debug for the traceback",
-        ) from exc
     for metric_series in answer:
         if not (
             metric_series.t_us.shape == metric_series.value.shape == metric_series.valid.shape

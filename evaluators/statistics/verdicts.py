@@ -22,6 +22,7 @@ Cause = Literal[
     "incomplete",
     "policy",
     "renderer",
+    "fixer",
     "undecided",
     "infrastructure",
     "evaluator",
@@ -33,6 +34,7 @@ EXIT_CODES: dict[Cause, int] = {
     "incomplete": 2,
     "policy": 2,
     "renderer": 2,
+    "fixer": 2,
     "undecided": 3,
     "infrastructure": 4,
     "evaluator": 5,
@@ -43,6 +45,7 @@ WORDS: dict[Cause, str] = {
     "incomplete": "INCOMPLETE",
     "policy": "POLICY FAILURE",
     "renderer": "RENDERER FAILURE",
+    "fixer": "FIXER FAILURE",
     "undecided": "UNDECIDED",
     "infrastructure": "INFRASTRUCTURE FAILURE",
     "evaluator": "EVALUATOR FAILURE",
@@ -54,6 +57,7 @@ SEVERITY: tuple[Cause, ...] = (
     "infrastructure",
     "policy",
     "renderer",
+    "fixer",
     "incomplete",
     "regression",
     "undecided",
@@ -104,6 +108,7 @@ CAUSES: dict[str, Cause] = {
     "evaluator": "evaluator",
     "policy": "policy",
     "renderer fault": "renderer",
+    "fixer fault": "fixer",
 }
 
 
@@ -123,9 +128,9 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
     counts = ", ".join(f"{name} {count}" for name, count in by_class.items())
     text = f"{n_failed} of {n} rollouts could not be run or scored ({counts})"
     causes = {CAUSES.get(name, "infrastructure") for name in by_class}
-    if causes == {"policy", "renderer"}:
-        return Outcome("policy", (text,))
-    return Outcome(causes.pop() if len(causes) == 1 else "infrastructure", (text,))
+    if "infrastructure" in causes:
+        return Outcome("infrastructure", (text,))
+    return Outcome(min(causes, key=SEVERITY.index), (text,))
 
 
 Verdict = Literal["non-inferior", "worse", "undecided"]

@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from alpasim_plugin.cli.signals import Stopped, stoppable
+from alpasim_plugin.cli.signals import stoppable
+from alpasim_plugin.core.errors import Stopped
 
 
 @pytest.fixture

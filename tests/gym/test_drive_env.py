@@ -239,3 +239,15 @@ def test_environments_run_in_processes_and_agree_with_one_in_this_process():
     assert worth[1] == pytest.approx(float(alone))
     several.close()
     one.close()
+
+
+def test_a_brake_takes_effect_after_the_latency_of_the_scenario():
+    overrides = ("latency.kind=fixed", "latency.fixed_us=500000", *SHORT)
+    env = DriveEnv("smoke/straight", "controls", camera="", overrides=overrides)
+    env.reset(seed=0)
+    speeds = [env.observation.ego.speed_mps]
+    for _ in range(7):
+        env.step(np.array([0.0, -1.0], np.float32))
+        speeds.append(env.observation.ego.speed_mps)
+    assert_allclose(speeds[1:6], speeds[0], atol=0.05)
+    assert speeds[7] < speeds[0] - 0.5

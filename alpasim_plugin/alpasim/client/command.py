@@ -257,6 +257,8 @@ class CommandPolicy(DriverPolicy):
         PolicyError: The command ends, or does not serve in time.
     """
 
+    runs_a_command = True  # of the user's, who is to blame where it hangs
+
     def __init__(self, scenario: Scenario, address: str) -> None:
         command = Command.parse(address)
         held = _served.get(command.text)

@@ -99,7 +99,7 @@ class CallTime:
             lock.release()
 
 
-def status_of(error: Exception) -> tuple[Any, str]:
+def status_of(error: BaseException) -> tuple[Any, str]:
     """Return the status and text that a caller gets for an error."""
     if isinstance(error, grpc.RpcError):
         code = error.code()
@@ -126,7 +126,7 @@ def answering(call: Callable[[Any, Any, Any], Any]) -> Callable[[Any, Any, Any],
     def answer(self: Any, request: Any, context: Any) -> Any:
         try:
             return call(self, request, context)
-        except Exception as error:
+        except BaseException as error:  # an exit of a served policy ends no thread of the server
             code, text = status_of(error)
             self.failed(call.__name__, code, text, error)
             context.abort(code, text)
@@ -140,7 +140,7 @@ class Failures:
     def __init__(self) -> None:
         self.statuses: Counter[str] = Counter()
 
-    def failed(self, call: str, code: Any, text: str, error: Exception) -> None:
+    def failed(self, call: str, code: Any, text: str, error: BaseException) -> None:
         """Note a failed call; an unforeseen error is logged with its traceback."""
         self.statuses[code.name] += 1
         foreseen = code is not Code.INTERNAL

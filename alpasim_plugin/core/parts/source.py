@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InputError, is_interruption
 from alpasim_plugin.core.files import file_sha256, read_bytes
 from alpasim_plugin.core.files.inputs import unrecorded
 from alpasim_plugin.core.parts.blame import raised
@@ -247,7 +247,9 @@ def load(target: str, kind: str) -> Any:
         found = getattr(module, attribute, None)  # a module of a file runs here
     except InputError:
         raise
-    except (Exception, SystemExit) as error:  # whatever a user's module raises while it is imported
+    except BaseException as error:  # whatever a user's module raises while it is imported
+        if is_interruption(error):
+            raise
         hint = IN_A_FILE if name.endswith(".py") else DO_THIS
         raise InputError(f"{kind} {target!r}: {raised(error)}", hint) from error
     if found is None:

@@ -13,10 +13,12 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core import interfaces
 from alpasim_plugin.core.errors import (
     EvaluatorError,
     FixerError,
+    FixerFault,
     InputError,
     PolicyError,
     RendererFault,
@@ -26,6 +28,7 @@ from alpasim_plugin.core.interfaces import complete, contract_error
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.core.parts.blame import blaming
 from alpasim_plugin.core.parts.source import code_digest, load, make_importable
+from alpasim_plugin.core.types import shielded
 
 # entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
 MODES = "simrun.fixer_modes"
@@ -108,6 +111,11 @@ class PartSpec:
     missing: str = ""
 
     @property
+    def is_users(self) -> bool:
+        """Tell whether its code is not simrun's, and runs in the process that builds it."""
+        return self.target.partition(".")[0] not in OWN_PACKAGES
+
+    @property
     def label(self) -> str:
         """Give the part and its weights in a few words: "onefixer, trained"."""
         own = getattr(self.settings, "name", "") or self.name
@@ -181,10 +189,17 @@ def part_digest(
 
 ERRORS: dict[str, type[SimrunError]] = {
     "renderer": RendererFault,
-    "fixer": FixerError,
+    "fixer": FixerFault,
     "policy": PolicyError,
     "evaluator": EvaluatorError,
 }  # whose failure it is; a controller or source that cannot be made is bad input
+
+
+def error_of(spec: PartSpec) -> type[SimrunError]:
+    """Return the error of a part that cannot be made."""
+    if spec.kind == "fixer" and not spec.is_users:
+        return FixerError
+    return ERRORS.get(spec.kind, InputError)
 
 
 def build(spec: PartSpec, **known: Any) -> Any:
@@ -192,7 +207,8 @@ def build(spec: PartSpec, **known: Any) -> Any:
 
     Args:
         spec: The resolved part.
-        known: What the factory may ask for by naming a parameter so;
+        known: What the factory may ask for by naming a parameter so, in a user's part data that it
+            cannot change;
             `alpasim_plugin.core.parts.spec` lists the names by kind.
 
     Raises:
@@ -201,15 +217,16 @@ def build(spec: PartSpec, **known: Any) -> Any:
         SimrunError: The factory raised; the error class is that of the part's kind.
     """
     kind = KINDS[spec.kind]
+    if spec.is_users:
+        known = {name: shielded(value) for name, value in known.items()}
     known = {"settings": spec.settings, "address": spec.address} | known
     factory = load(spec.target, spec.kind)
     wanted = _arguments(
         factory, spec, {key: value for key, value in known.items() if key in kind.arguments}
     )
     name = f"{spec.kind} {spec.name!r}"
-    with blaming(ERRORS.get(spec.kind, InputError), name):
-        part = factory(**wanted)
-    return complete(part, kind.interface, name)
+    with blaming(error_of(spec), name, "", spec.is_users):
+        return complete(factory(**wanted), kind.interface, name)
 
 
 def _arguments(

@@ -1,0 +1,213 @@
+"""Parts that end, leave, change or fill their process, twenty ways, each as a policy, a renderer, a
+fixer, an evaluator and a served policy.
+
+``PolicyExit``, ``RendererExit``... are made of the table below.
+"""
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from alpasim_plugin.core.types import Frame, MetricInfo, SensorSpec
+from evaluators.metrics.score import series
+from policies.simple import ConstantVelocity
+
+HOUR_S = 3600
+NOTHING = "nothing_m"
+
+
+def leave(value):
+    sys.exit(0)
+
+
+def leave_with_three(value):
+    sys.exit(3)
+
+
+def interrupt(value):
+    raise KeyboardInterrupt
+
+
+def end_generator(value):
+    raise GeneratorExit
+
+
+def end_process(value):
+    os._exit(0)
+
+
+def crash(value):
+    ctypes.string_at(0)
+
+
+def be_killed(value):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def be_terminated(value):
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def spin(value):
+    while True:
+        pass
+
+
+def sleep(value):
+    time.sleep(HOUR_S)
+
+
+def start_thread(value):
+    threading.Thread(target=time.sleep, args=(HOUR_S,)).start()
+    return value
+
+
+def fork(value):
+    os.fork()  # both copies go on
+    return value
+
+
+def start_process(value):
+    context = multiprocessing.get_context("fork")
+    context.Process(target=time.sleep, args=(HOUR_S,), daemon=True).start()
+    return value
+
+
+def change_folder(value):
+    os.chdir("/")
+    return value
+
+
+def patch_library(value):
+    np.hypot = np.linalg.norm = lambda *arguments, **settings: np.float64(0.0)
+    return value
+
+
+def close_files(value):
+    os.closerange(3, 4096)
+    return value
+
+
+def close_output(value):
+    for stream in (sys.stdout, sys.stderr):
+        stream.close()
+    return value
+
+
+def run_out_of_memory(value):
+    raise MemoryError("10 GB")
+
+
+def recurse(value):
+    return recurse(value)
+
+
+def lie(value):
+    """Return something else."""
+    return SimpleNamespace(xy="here")
+
+
+FAULTS = {
+    fault.__name__: fault
+    for fault in (
+        leave,
+        leave_with_three,
+        interrupt,
+        end_generator,
+        end_process,
+        crash,
+        be_killed,
+        be_terminated,
+        spin,
+        sleep,
+        start_thread,
+        fork,
+        start_process,
+        change_folder,
+        patch_library,
+        close_files,
+        close_output,
+        run_out_of_memory,
+        recurse,
+        lie,
+    )
+}
+# What harms nobody but, perhaps, the part itself: its rollout may be as good as any.
+HARMLESS = {
+    "start_thread",
+    "fork",
+    "start_process",
+    "change_folder",
+    "patch_library",
+    "close_output",
+}
+
+
+class Watcher(ConstantVelocity):
+    """Straight on, with a camera that it does not look at."""
+
+    sensors = (SensorSpec("front", 300_000),)
+
+
+class Passing:
+    """A fixer that changes nothing."""
+
+    def reset(self, seed):
+        pass
+
+    def step(self, block, maps):
+        return list(block)
+
+
+def _policy(fault):
+    class Bad(ConstantVelocity):
+        def act(self, observation):
+            return fault(super().act(observation))
+
+    return Bad
+
+
+def _renderer(fault):
+    class Bad:
+        def render(self, request):
+            shape = (request.camera.height, request.camera.width, 3)
+            return fault(Frame(request.t_us, request.camera.name, np.full(shape, 90, np.uint8)))
+
+    return Bad
+
+
+def _fixer(fault):
+    class Bad(Passing):
+        def step(self, block, maps):
+            return [fault(replace(frame)) for frame in block]
+
+    return Bad
+
+
+def _evaluator(fault):
+    class Bad:
+        metrics = {NOTHING: MetricInfo("m", "lower", "max", "always nothing", margin=0.1)}  # noqa: RUF012 - as a plug-in writes it
+
+        def __call__(self, rollout, scene):
+            return fault([series(NOTHING, rollout.ego.t_us, 0.0)])
+
+    return Bad
+
+
+for _kind in (_policy, _renderer, _fixer, _evaluator):
+    for _name, _fault in FAULTS.items():
+        globals()[f"{_kind.__name__[1:]}_{_name}"] = _kind(_fault)
+
+
+if __name__ == "__main__":
+    from alpasim_plugin import serve_policy
+
+    serve_policy(_policy(FAULTS[sys.argv[1]]))
