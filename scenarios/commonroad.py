@@ -25,6 +25,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
     Vehicle,
 )
+from scenarios.commonroad_fields import COMMONROAD
 from scenarios.commonroad_map import number, point, read_lanelets
 from scenarios.map_lines import ground_of
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
@@ -236,6 +237,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         "the planning problem is not used: it asks for a drive and records none",
         *map_notes,
         *obstacle_notes,
+        *COMMONROAD.notes_of_xml(root),
     )
     return RecordedLog(
         scene_id=f"commonroad-{root.get('benchmarkID') or file.stem}",

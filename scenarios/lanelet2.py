@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -23,6 +23,7 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, some_of
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, heading_of, se2, transform_points
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
@@ -52,6 +53,24 @@ MPS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "": 1 / 3.6, "mph": 0.44704, "m/s": 1.0,
 JUNCTION_M = 60.0  # lights whose lines lie nearer to each other belong to one junction
 SIGN_M, PLATE_M = 2.1, 0.6  # height of signs, and of a sign itself
 LAMPS_M = 0.9  # height of a light whose map does not state it
+
+
+LANELET2 = Fields(
+    "Lanelet2",
+    read={
+        "lanelet": "@type @subtype @one_way @participant @speed_limit left right regulatory_element",
+        "regulatory_element": "@type @subtype @sign_type @fallback refers ref_line yield",
+        "way": "@type @subtype @color @height",
+        "node": "@local_x @local_y @ele",
+    },
+    harmless={
+        # Limits by location have a note of their own.
+        "lanelet": "@location @region @road_name @name @width @turn_direction @area @source",
+        "regulatory_element": "right_of_way @name light_bulbs",
+        "way": "@width @name @area @temporary @source @traffic_light_id",
+        "node": "@type @subtype @color @name @mgrs_code @source",
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -294,8 +313,22 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         lengths,
         spots,
         osm.origin,
-        (*osm.notes, *notes),
+        (*osm.notes, *notes, *LANELET2.notes(_met(osm))),
     )
+
+
+def _met(osm: Osm) -> Iterator[str]:
+    """Yield the names of the fields of a map: tags and roles of lanelets, regulatory elements and
+    ways, and attributes of nodes.
+    """
+    for holder, items in (("lanelet", osm.lanelets), ("regulatory_element", osm.rules)):
+        for item in items.values():
+            yield from (field_name(holder, f"@{tag.partition(':')[0]}") for tag in item.tags)
+            yield from (field_name(holder, role) for _, role, _ in item.members)
+    for item in osm.items["way"].values():
+        yield from (field_name("way", f"@{tag}") for tag in item.tags)
+    for item in osm.items["node"].values():
+        yield from (field_name("node", f"@{tag}") for tag in item.tags)
 
 
 def _participants(lanelet: Item) -> dict[str, bool]:

@@ -24,6 +24,7 @@ from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.files.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F64
+from scenarios.opendrive_fields import OPENDRIVE
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 _TABLE = 2001  # places at which a cubic's arc length is tabulated before it is inverted
@@ -301,7 +302,7 @@ def parse_map(where: Path | str, root: Element) -> OdrMap:
             for junction in root.findall("junction")
             for one in junction.findall("connection")
         )
-    notes = _odd_sides(elements)
+    notes = [*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root)]
     notes += [
         f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
         for tag in sorted({child.tag for child in root} - KNOWN)
@@ -321,6 +322,11 @@ def parse_map(where: Path | str, root: Element) -> OdrMap:
     )
     if both_ways:
         notes.append(f"lanes for both directions are driven in one only: {both_ways}")
+    repainted = sum(len(lane.findall("roadMark")) > 1 for lane in root.iter("lane"))
+    if repainted:
+        notes.append(
+            f"lanes that change their marking inside a section, of which the first holds: {repainted}"
+        )
     shapes = len(root.findall(".//lateralProfile/shape"))
     if shapes:
         notes.append(f"{shapes} cross section shapes of the map are not used")

@@ -27,7 +27,7 @@ from alpasim_plugin.core.geometry import (
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat, height_at
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
-from scenarios.osi_messages import UNREAD, ground_truths
+from scenarios.osi_messages import OSI, UNREAD, ground_truths, met_fields
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
 VEHICLE, PEDESTRIAN = 2, 3  # types of moving objects
@@ -103,6 +103,7 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         if not count:
             unread = {name: len(getattr(message, name)) for name in UNREAD}
             notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
+            notes += OSI.notes(met_fields(message))
         count += 1
         if ego is None and truth.host is not None:
             ego = str(truth.host)

@@ -1,7 +1,7 @@
 """Messages of the Open Simulation Interface, as far as they are read here: a subset of names, field
 numbers and types of OSI 3, and the file that holds them.
 
-Fields that are not listed are skipped, in either version of the wire's syntax.
+Of other fields those of the first message are named, in either version of the wire's syntax.
 
 Source: ASAM OSI 3.7, osi_groundtruth, osi_sensorview, osi_object, osi_lane, osi_common; trace files
 have a length of four bytes, little-endian, before each message, or are MCAP.
@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.unknown_fields import UnknownFieldSet
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.lazy import require_library
 from scenarios.recorded import SourceFiles
 
@@ -79,6 +81,50 @@ FIELDS = {
 }
 TRUTH_KINDS = ("GroundTruth", "SensorView")
 MCAP_SCHEMAS = tuple(f"osi3.{name}" for name in TRUTH_KINDS)
+# Fields of OSI 3.8 that are not in `FIELDS`, by their number.
+OTHERS = {
+    "GroundTruth": """1 version 11 occupant 12 environmental_conditions 13 country_code
+        14 proj_string 15 map_reference 16 model_reference 17 reference_line
+        18 logical_lane_boundary 19 logical_lane 20 proj_frame_offset""",
+    "MovingObject": """4 assigned_lane_id 7 model_reference 8 future_trajectory
+        9 moving_object_classification 10 source_reference 11 color_description
+        12 pedestrian_attributes""",
+    "Base": """4 velocity 5 acceleration 6 orientation_rate 7 base_polygon
+        8 orientation_acceleration 9 bounding_box_section""",
+    "Attributes": """1 driver_id 2 radius_wheel 3 number_wheels 6 ground_clearance 7 wheel_data
+        8 steering_wheel_angle""",
+    "VehicleClass": "2 light_state 3 has_trailer 4 trailer_id 5 role",
+    "Lane": "3 source_reference",
+    "LaneClass": "2 is_host_vehicle_lane 10 free_lane_boundary_id 11 road_condition",
+    "LaneBoundary": "4 source_reference 5 color_description",
+    "BoundaryPoint": "2 width 3 height 4 dash",
+    "BoundaryClass": "3 limiting_structure_id",
+}
+OSI = Fields(
+    "OSI",
+    read={
+        name: " ".join(text.split()[0] for text in fields)
+        for name, fields in FIELDS.items()
+        if fields and name not in ("Detected", "SensorData", "TrafficUpdate")
+    },
+    harmless={
+        # Coordinates are local; motion is that of the places; what stands beside the road and the
+        # logical view of the lanes change no drive.
+        "GroundTruth": """version occupant country_code proj_string map_reference model_reference
+            reference_line logical_lane_boundary logical_lane""",
+        "MovingObject": """assigned_lane_id model_reference future_trajectory source_reference
+            color_description pedestrian_attributes""",
+        "Base": "velocity acceleration orientation_rate orientation_acceleration base_polygon",
+        "Attributes": """driver_id radius_wheel number_wheels ground_clearance wheel_data
+            steering_wheel_angle""",
+        "VehicleClass": "light_state role",
+        "Lane": "source_reference",
+        "LaneClass": "is_host_vehicle_lane free_lane_boundary_id road_condition",
+        "LaneBoundary": "source_reference color_description",
+        "BoundaryPoint": "width height dash",
+        "BoundaryClass": "limiting_structure_id",
+    },
+)
 UNREAD = ("stationary_object", "traffic_sign", "traffic_light", "road_marking")
 
 
@@ -169,6 +215,23 @@ def _truth_of(part: bytes, classes: Mapping[str, Any], where: str) -> Truth:
     host = _host_of(view)
     inside = view.global_ground_truth
     return Truth(inside, _host_of(inside) if host is None else host)
+
+
+def met_fields(message: Any) -> Iterator[str]:
+    """Yield the names of the fields that a message and those in it have beyond `FIELDS`."""
+    kind = message.DESCRIPTOR.name
+    names = OTHERS.get(kind, "").split()
+    by_number = dict(zip(names[::2], names[1::2], strict=True))
+    if kind == "Unread":
+        return
+    for field in UnknownFieldSet(message):
+        number = str(field.field_number)
+        yield field_name(kind, by_number.get(number, f"field {number}"))
+    for described, value in message.ListFields():
+        if described.message_type is not None:
+            parts = [value] if isinstance(value, Message) else value
+            for part in parts:
+                yield from met_fields(part)
 
 
 def _host_of(message: Any) -> int | None:

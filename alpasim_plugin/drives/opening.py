@@ -9,6 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import contents, natural_order, parsing, real, some_of
+from alpasim_plugin.core.files.fields import field_name
 from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
@@ -17,7 +18,7 @@ from alpasim_plugin.drives.source import Points, SourceDrive, in_order, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
-    KNOWN_KEYS,
+    TRANSFORMS,
     PosedPhotograph,
     inside,
     present,
@@ -83,9 +84,7 @@ def _transforms(folder: Path, need_files: bool) -> SourceDrive:
             f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {some_of(missing)}"
         )
     files = {one.file for one in there}
-    unknown = sorted({key for one in listed for key in one.more} - KNOWN_KEYS)
-    if unknown:
-        notes.append(f"keys of {FILE} that are not read: {some_of(unknown)}")
+    notes += TRANSFORMS.notes(field_name("frame", key) for one in listed for key in one.more)
     folders = {one.file: os.path.relpath(one.file.parent, folder) for one in listed}
     if len(set(folders.values())) == 1 or len({one.name for one in folders}) == len(folders):
         folders = dict.fromkeys(folders, "front")  # one camera does not use a name twice

@@ -1,5 +1,5 @@
-"""Write the tables of options, metrics and scenario keys into docs/cli.md, docs/metrics.md and
-docs/scenario-files.md, from the code.
+"""Write the tables of options, metrics, scenario keys and fields of file formats into docs/cli.md,
+docs/metrics.md, docs/scenario-files.md and docs/formats.md, from the code.
 
     python docs/scripts/reference_tables.py [--check]
 
@@ -17,8 +17,14 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from alpasim_plugin.cli.main import PANELS, load_verb
+from alpasim_plugin.gaussians.files.sog import SOG
+from alpasim_plugin.gaussians.fit.photographs import TRANSFORMS
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
+from scenarios.commonroad_fields import COMMONROAD
+from scenarios.lanelet2 import LANELET2
+from scenarios.opendrive_fields import OPENDRIVE
+from scenarios.osi_messages import OSI
 from scenarios.schema import models
 from scenarios.schema_parts import Part
 
@@ -142,10 +148,17 @@ def key_tables() -> str:
     return "\n".join(sections)
 
 
+def field_table() -> str:
+    """Return the table of the fields that readers know."""
+    formats = (OPENDRIVE, LANELET2, COMMONROAD, OSI, TRANSFORMS, SOG)
+    head = ("form", "read", "left out without a change")
+    return table(head, [fields.row() for fields in formats])
+
+
 def written() -> dict[Path, str]:
     """Return the pages as they should be."""
     tables = {"cli": ("options", cli_tables()), "metrics": ("metrics", metric_table()),
-              "scenario-files": ("keys", key_tables())}  # fmt: skip
+              "scenario-files": ("keys", key_tables()), "formats": ("fields", field_table())}  # fmt: skip
     return {
         (page := DOCS / f"{name}.md"): replaced(page.read_text(encoding="utf-8"), block, content)
         for name, (block, content) in tables.items()

@@ -198,3 +198,9 @@ def test_lanes_under_the_side_that_is_not_of_their_number_are_named():
     assert lanes.lanes["1.0.-1"].right[0, 1] == pytest.approx(-3.5)
     assert any("-1 of road 1" in note for note in notes)
     assert not read(made)[1]
+
+
+def test_fields_that_are_not_read_are_named():
+    height = '<height sOffset="0" inner="0.1" outer="0.1"/></lane>'
+    _, notes = read(road("1", section(0, lane(-1).replace("</lane>", height))))
+    assert "OpenDRIVE: not read are lane/height (1)" in notes

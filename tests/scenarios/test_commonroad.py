@@ -414,3 +414,10 @@ def test_another_ego_can_be_asked_for(tmp_path):
     log = read(tmp_path, ego="12")
     assert [a.actor_id for a in log.actors] == ["11", "13"]
     assert log.notes[0] == "ego is the recorded vehicle 12, as asked"
+
+
+def test_fields_that_are_not_read_are_named(tmp_path):
+    lights = "<signalSeries><signalState/></signalSeries></obstacle>"
+    made = read(tmp_path, traffic=TRAFFIC.replace("</obstacle>", lights))
+    assert "CommonRoad: not read are obstacle/signalSeries (3)" in made.notes
+    assert not [note for note in read(tmp_path).notes if "not read are" in note]

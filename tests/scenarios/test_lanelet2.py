@@ -333,3 +333,8 @@ def test_vehicles_cross_the_route_where_a_rule_says_who_goes_first(tmp_path, rul
         sides = [np.sign(a.track.xyz[[0, -1], 1] - made.ego_log.xyz[0, 1]) for a in made.actors]
         across |= {seed for begin, end in sides if begin < 0 < end}
     assert bool(across) == ruled
+
+
+def test_fields_that_are_not_read_are_named(tmp_path):
+    made = street(tmp_path, (*places(), *WAYS, lanelet(1, 212, 112, dynamic="yes")))
+    assert "Lanelet2: not read are lanelet@dynamic (1)" in made.notes

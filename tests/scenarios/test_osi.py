@@ -266,3 +266,12 @@ def test_esmini_s_traces_have_the_poses_and_roads_of_their_facts(shared_data):
     assert centre[[0, -1]] == pytest.approx([31.4, 153.503], abs=1e-3)
     other = cut_in.actors[0].track.xyz[[0, -1], :2] + cut_in.world_origin[:2]
     assert other == pytest.approx(np.array([[51.45, 1.535], [221.911, -1.535]]), abs=1e-3)
+
+
+def test_fields_that_are_not_read_are_named(tmp_path):
+    parts = messages()
+    # Field 12, environmental_conditions, and field 99, which OSI 3.8 does not have, with two bytes.
+    parts[0].MergeFromString(b"\x62\x02ab\x9a\x06\x02ab")
+    (note,) = [note for note in load_scenario(written(tmp_path, parts)).notes if "not read" in note]
+    assert "GroundTruth/environmental_conditions (1)" in note
+    assert "GroundTruth/field 99 (1)" in note

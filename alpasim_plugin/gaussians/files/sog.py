@@ -19,6 +19,7 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, read_bytes
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
 from alpasim_plugin.core.files.reading import as_shape, parsing, some_of
 from alpasim_plugin.core.types import F64, U8
@@ -57,7 +58,12 @@ class _Meta(TypedDict):
     sh0: _Plane
 
 
-KNOWN = {*_Meta.__annotations__, "shN", "asset", "antialias", "model"}  # keys of `META`
+# What is not listed may change what is drawn, and is refused.
+SOG = Fields(
+    "SOG",
+    read={META: " ".join((*_Meta.__annotations__, "shN", "antialias", "model"))},
+    harmless={META: "asset"},
+)
 
 
 def is_sog(path: Path) -> bool:
@@ -96,7 +102,8 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     meta = as_shape(_Meta, document, where, DO_THIS)
     if meta["version"] != 2:
         raise InputError(f"{where}: version {meta['version']}", DO_THIS)
-    unknown = sorted(set(document) - KNOWN)
+    known = SOG.names() | SOG.names(harmless=True)
+    unknown = sorted(key for key in document if field_name(META, key) not in known)
     if unknown:
         raise InputError(
             f"{where}: keys that may change what is drawn: {some_of(unknown)}", DO_THIS

@@ -30,6 +30,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_bytes, read_json_object
+from alpasim_plugin.core.files.fields import Fields
 from alpasim_plugin.core.files.images import check_image, decode_image, image_fault
 from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.files.reading import as_shape
@@ -57,15 +58,21 @@ COEFFICIENTS = {  # of each lens model, in the order of OpenCV
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     "FULL_OPENCV": BENDS,
 }
-# Keys of a file and of its frames that change nothing of what is read, or are read below.
-_KEYS = """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y cx cy
-    camera_angle_x camera_angle_y x_fov y_fov k1 k2 k3 k4 k5 k6 p1 p2 file_path transform_matrix
-    t_us camera use exposure aabb_scale scale offset render_aabb up sharpness
-    colmap_im_id applied_transform applied_scale orientation_override auto_scale_poses_override
-    train_filenames val_filenames test_filenames depth_unit_scale_factor
-    integer_depth_scale enable_depth_loading n_extra_learnable_dims white_transparent
-    black_transparent"""
-KNOWN_KEYS = frozenset(_KEYS.split())
+TRANSFORMS = Fields(
+    FILE,
+    read={
+        "frame": """frames axes unit ply_file_path camera_model is_fisheye w h fl_x fl_y cx cy
+            camera_angle_x camera_angle_y x_fov y_fov k1 k2 k3 k4 k5 k6 p1 p2 file_path
+            transform_matrix t_us camera use"""
+    },
+    # Settings of viewers and of trainers, and what was done to the poses before they were written.
+    harmless={
+        "frame": """exposure aabb_scale scale offset render_aabb up sharpness colmap_im_id applied_transform
+            applied_scale orientation_override auto_scale_poses_override train_filenames
+            val_filenames test_filenames depth_unit_scale_factor integer_depth_scale
+            enable_depth_loading n_extra_learnable_dims white_transparent black_transparent"""
+    },
+)
 WHOLE = "give a whole PNG or JPEG in grey or RGB"
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
