@@ -16,8 +16,7 @@ from scenarios.load import load_scenario
 from tests.drives.opened_drives import assert_is_the_street, opened
 from tests.drives.py123d_log import ORIGIN, TYPES, write_py123d
 from tests.drives.street import COUNT
-
-pytestmark = pytest.mark.slow
+from tests.examples import first_of
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def test_a_log_is_the_street_with_its_vehicle_and_the_car_that_moves(log):
     assert "lidar.lidar_top" in str(drive.notes)
 
 
-@pytest.mark.parametrize("codec", sorted(TYPES))
+@pytest.mark.parametrize("codec", first_of(sorted(TYPES)))
 def test_images_are_read_however_they_are_kept(tmp_path, log, codec):
     drive = read_source(write_py123d(tmp_path / codec, codec, implicit_poses=True))
     truth = read_source(log)
@@ -50,6 +49,7 @@ def test_images_are_read_however_they_are_kept(tmp_path, log, codec):
     assert one.T_world_camera[:2, 3] == pytest.approx(ORIGIN[:2] + np.array([3.0, 0.0]), abs=0.1)
 
 
+@pytest.mark.slow
 def test_an_imported_log_drives_with_its_road_user(log, tmp_path, quick_fit):
     import_drive(log, tmp_path / "out")
     scenario = load_scenario(tmp_path / "out/scenario.yaml")

@@ -8,10 +8,10 @@ from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.source import checked
 from tests.drives.opened_drives import opened
 from tests.drives.street import COUNT, edited, write_colmap, write_transforms
+from tests.examples import first_rows_of
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path):
     for axes in ("opencv", "opengl"):
         drive, _ = opened(write_transforms(tmp_path / axes, axes=axes, say_axes=False))
@@ -20,11 +20,13 @@ def test_transforms_of_both_conventions_are_recognised_without_a_word(tmp_path):
 
 @pytest.mark.parametrize(
     ("model", "bend"),
-    [
-        ("SIMPLE_RADIAL", (-0.05,)),
-        ("OPENCV", (-0.08, 0.01, 0.001, -0.001)),
-        ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0)),
-    ],
+    first_rows_of(
+        [
+            ("SIMPLE_RADIAL", (-0.05,)),
+            ("OPENCV", (-0.08, 0.01, 0.001, -0.001)),
+            ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0)),
+        ]
+    ),
 )
 def test_photographs_are_freed_of_every_lens(tmp_path, model, bend):
     drive = read_source(write_colmap(tmp_path / "a", True, model, bend))

@@ -10,6 +10,7 @@ from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
+from tests.examples import first_of
 from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import camera, random_cloud
 from tests.gaussians.gradient_scenes import (
@@ -25,14 +26,12 @@ from tests.gaussians.gradient_scenes import (
 )
 from tests.gaussians.hard_gradients import HARD, SMALL, TOLERANCE, overlapping
 
-pytestmark = pytest.mark.slow
-
 
 def cloud_of_scene(s):
     return cloud_of(Splats(*(torch.tensor(a, dtype=torch.float32) for a in s.arrays().values())))
 
 
-@pytest.mark.parametrize("make", HARD)
+@pytest.mark.parametrize("make", first_of(HARD, 3))
 def test_gradient_equals_finite_differences_of_the_reference(make):
     s = make()
     found, _ = kernel_gradients(s)
@@ -84,7 +83,7 @@ def test_gradient_on_the_screen_is_that_of_the_projected_mean():
     assert np.allclose(out.uv.grad, numeric, rtol=1e-3, atol=1e-3 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("threads", [2, 5])
+@pytest.mark.parametrize("threads", first_of([2, 5]))
 def test_image_and_gradients_do_not_depend_on_threads(threads):
     cloud = driving_like_scene(9000)
     cam = driving_camera(120, 70)
