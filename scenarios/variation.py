@@ -6,7 +6,7 @@ actor does not change the others.
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,13 @@ from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
-from alpasim_plugin.core.files.config import Document, apply_overrides, dotted, validate
+from alpasim_plugin.core.files.config import (
+    Document,
+    apply_overrides,
+    dotted,
+    override_locations,
+    validate,
+)
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.seeding import stream
 from scenarios.schema import RangeSpec, ScenarioSpec
@@ -68,13 +74,20 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
         InputError: A key or value that the schema refuses, or a name that stands twice, with its
             position.
     """
+    as_read = document
     document = apply_overrides(document, overrides)
     own_seed = document.data.get("seed", 0) if isinstance(document.data, dict) else 0
     if seed is not None:
         document = apply_overrides(document, [f"seed={int(seed)}"])
     written = validate(ScenarioSpec, document)
     scene_id = written.scene_id or _default_id(Path(document.path))
-    fixed = tuple(text.partition("=")[0].strip() for text in overrides)
+    located = override_locations(as_read, overrides)
+    ids = {str(i): actor.id for i, actor in enumerate(written.actors)}
+    fixed = frozenset(
+        _by_id(".".join(map(str, (*loc, *below))), ids)
+        for loc, value in located
+        for below in _paths_below(value)
+    )
     chosen: JsonObject = {}
     for key, rule in written.variations.items():
         rng = stream(scene_id, written.seed, f"scenario/variation/{key}")
@@ -82,8 +95,15 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
             chosen[key] = float(rng.uniform(rule.low, rule.high))
         else:
             chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
-    kept = [f"{key}={json.dumps(value)}" for key, value in chosen.items() if key not in fixed]
+    kept = [
+        f"{key}={json.dumps(value)}"
+        for key, value in chosen.items()
+        if fixed.isdisjoint(_and_above(_by_id(key, ids)))
+    ]
     document = apply_overrides(document, kept, origin="variation")
+    # A variation of a whole section leaves what the user set in it.
+    again = [f"{'.'.join(map(str, loc))}={json.dumps(value)}" for loc, value in located]
+    document = apply_overrides(document, again)
     spec = validate(ScenarioSpec, document)
     seen: dict[str, int] = {}
     for i, actor in enumerate(spec.actors):
@@ -113,7 +133,7 @@ def _default_id(path: Path) -> str:
     return resolved.stem if os.path.isfile(resolved) else resolved.name
 
 
-def _jitter(spec: ScenarioSpec, scene_id: str, fixed: tuple[str, ...]) -> ScenarioSpec:
+def _jitter(spec: ScenarioSpec, scene_id: str, fixed: Collection[str]) -> ScenarioSpec:
     """Return the specification with road, ego and actors changed within the declared ranges."""
     ids = {str(i): actor.id for i, actor in enumerate(spec.actors)}
     touched = {_by_id(key, ids) for key in (*fixed, *spec.variations)}
@@ -166,6 +186,25 @@ def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
     else:
         return {".".join(map(str, loc)): part}
     return {key: value for name, item in pairs for key, value in _flat(item, (*loc, name)).items()}
+
+
+def _paths_below(value: Any) -> Iterator[tuple[str | int, ...]]:
+    """Yield the path of a plain value itself, and of everything inside it."""
+    yield ()
+    inside = value.items() if isinstance(value, dict) else ()
+    if isinstance(value, list):
+        inside = [
+            (part.get("id", i) if isinstance(part, dict) else i, part)
+            for i, part in enumerate(value)
+        ]
+    for key, part in inside:
+        yield from ((key, *below) for below in _paths_below(part))
+
+
+def _and_above(key: str) -> set[str]:
+    """Return a dotted key and those that hold it."""
+    parts = key.split(".")
+    return {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
 
 
 def _by_id(key: str, ids: dict[str, str]) -> str:

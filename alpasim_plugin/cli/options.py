@@ -17,6 +17,7 @@ from typer.core import TyperArgument
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.limits import SEED, SEEDS
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.parts.grammar import split_label
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, SUMMARY
 
 FIXER_PREFIX = "fixer."
@@ -187,10 +188,10 @@ def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[st
     of_scene = []
     of_fixer = []
     for text in overrides:
-        key, equals, value = text.partition("=")
-        renderer, fixer, rest = key.rpartition(FIXER_PREFIX)
-        if fixer and (not renderer or renderer.endswith(":")):
-            of_fixer.append(renderer + rest + equals + value)
+        label, rest = split_label(text)
+        if rest.startswith(FIXER_PREFIX):
+            own = rest.removeprefix(FIXER_PREFIX)
+            of_fixer.append(f"{label}:{own}" if label else own)
         else:
             of_scene.append(text)
     return tuple(of_scene), tuple(of_fixer)

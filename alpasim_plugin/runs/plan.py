@@ -17,6 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
+from alpasim_plugin.core.parts.grammar import split_label
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.schema import rollout_folder
@@ -265,7 +266,7 @@ def _check_fixer_settings(
 ) -> None:
     """Refuse settings of fixers that no renderer has."""
     fixed = {spec.name for spec in renderers if spec.fixer is not None}
-    labels = {label for text in settings if (label := text.partition("=")[0].rpartition(":")[0])}
+    labels = {label for label, _ in map(split_label, settings) if label}
     if unknown := sorted(labels - fixed):
         raise InputError(
             f"--set {unknown[0]}:fixer...: no fixer of that name among the renderers {list(names)}",

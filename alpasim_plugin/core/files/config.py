@@ -281,12 +281,40 @@ def apply_overrides(
             raise InputError(
                 f"{where}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
             )
-        loc = _assign(data, key.strip().split("."), parse(value, where).data, where)
+        loc = _assign(data, key.strip().split("."), value_of(value, where), where)
         marks = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
         for n in range(1, len(loc)):
             marks.setdefault(loc[:n], Mark(where, 0, 0))
         marks[loc] = Mark(where, 0, 0)
     return Document(data, marks, document.path)
+
+
+def value_of(text: str, where: str) -> Any:
+    """Return the plain data of a value on the command line: YAML, in which ``#`` begins no comment.
+
+    Raises:
+        InputError: It is not valid YAML.
+    """
+    if re.search(r"(^|\s)#", text) and not re.search(r"[\"'\[\]{}\n]", text):
+        return text.strip()
+    return parse(text, where).data
+
+
+def override_locations(document: Document, overrides: Sequence[str]) -> list[tuple[Key, Any]]:
+    """Return the key path and the value of each override, however it names its key: list items go
+    by their index.
+
+    Raises:
+        InputError: As `apply_overrides`.
+    """
+    data = copy.deepcopy(document.data)
+    found = []
+    for text in overrides:
+        where = f"--set {text}"
+        key, _, value = text.partition("=")
+        plain = value_of(value, where)
+        found.append((_assign(data, key.strip().split("."), plain, where), plain))
+    return found
 
 
 def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:

@@ -18,6 +18,7 @@ from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.files.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.interfaces import Declaration, require_methods
 from alpasim_plugin.core.lazy import installed
+from alpasim_plugin.core.parts.grammar import parse_renderer, split_label
 from alpasim_plugin.core.parts.registry import RegisteredPart, default_settings, entries
 from alpasim_plugin.core.parts.source import (
     absolute_target,
@@ -209,14 +210,12 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one
             without the weights that it needs.
     """
-    plain, own = split_settings(name)
-    front, plus, base = plain.partition("+")
-    steps = re.fullmatch(r"(.+)@([0-9]+)", base)
-    if steps is not None and "@" not in front:  # they stand at the end, and belong to the fixer
-        front = f"{front}@{steps[2]}"
-        base = steps[1]
+    parsed = parse_renderer(name)
+    own = parsed.settings
+    base = parsed.base
+    front = f"{parsed.part}@{parsed.steps}" if parsed.steps else parsed.part
     renderers = entries("renderer")
-    if not plus and (front in renderers or "://" in front or _is_renderer(front)):
+    if not base and (front in renderers or "://" in front or _is_renderer(front)):
         if own:
             raise InputError(
                 f"renderer {name!r}: {front!r} is no fixer: it has no settings for brackets",
@@ -225,7 +224,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         return RendererSpec(name, resolve("renderer", front))
     fixers = entries("fixer")
     if not is_target(front) and split_steps(front)[0] not in fixers:
-        if plus and front in renderers and split_steps(base)[0] in fixers:
+        if base and front in renderers and split_steps(base)[0] in fixers:
             raise InputError(
                 f"renderer {name!r}: the fixer stands before the renderer", f"Write {base}+{front}."
             )
@@ -242,7 +241,7 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         )
     if fixer.missing:
         raise InputError(f"fixer {fixer.name!r}: {fixer.note}", fixer.missing)
-    return RendererSpec(name, resolve("renderer", base if plus else BASE), fixer)
+    return RendererSpec(name, resolve("renderer", base or BASE), fixer)
 
 
 def _is_renderer(name: str) -> bool:
@@ -292,8 +291,8 @@ def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
         >>> overrides_of("difix", ["difix:window=2", "precision=bf16", "gsfix3d:steps=4"])
         ('precision=bf16', 'window=2')
     """
-    named = [(text.partition("=")[0].rpartition(":")[0], text) for text in overrides]
-    own = (text[len(label) + 1 :] for label, text in named if label == renderer)
+    named = [split_label(text) for text in overrides]
+    own = (text for label, text in named if label == renderer)
     return (*(text for label, text in named if not label), *own)
 
 

@@ -304,11 +304,11 @@ def make_importable(target: str) -> str:
     file, _, _ = target.rpartition(":")
     if not file.endswith(".py"):
         return file
+    file = os.path.realpath(file)  # what a link leads to lies beside its own modules
     root = top_folder(file)
-    real_root = os.path.realpath(root)
     if INSTALLED.isdisjoint(Path(root).parts):
-        for path in sorted(reached(file) - {os.path.join(real_root, os.path.basename(file))}):
-            top = Path(os.path.relpath(path, real_root)).parts[0].removesuffix(".py")
+        for path in sorted(reached(file) - {os.path.join(root, os.path.basename(file))}):
+            top = Path(os.path.relpath(path, root)).parts[0].removesuffix(".py")
             if not _is_installed(top):
                 _serve(top, module_file(root, [top]))
     parts = list(Path(os.path.relpath(file, root)).with_suffix("").parts)
