@@ -96,13 +96,13 @@ def camera_frame(observation: Observation, camera: CameraSpec, policy: str) -> F
     frame = observation.frames.get(camera.name)
     expected = (camera.height, camera.width)
     if frame is None or frame.size != expected:
-        found = (
+        problem = (
             f"frames of {sorted(observation.frames)}"
             if frame is None
             else f"a frame of {frame.size}"
         )
         raise PolicyError(
-            f"policy {policy!r} at {observation.t_us} us: {found}; needed is {camera.name!r} of {expected} (height, width)",
+            f"policy {policy!r} at {observation.t_us} us: {problem}; needed is {camera.name!r} of {expected} (height, width)",
             "render the cameras that the policy names in `sensors`, at the scenario's size",
         )
     return frame
@@ -146,11 +146,11 @@ def smooth_line(points: F64) -> F64:
     """
     s = arc_lengths(points)
     keep = np.concatenate([[True], s[1:] - s[:-1] > 1e-6])
-    at = np.arange(0.0, max(float(s[-1]), Path.SPACING_M) + 1e-9, Path.SPACING_M)
+    samples = np.arange(0.0, max(float(s[-1]), Path.SPACING_M) + 1e-9, Path.SPACING_M)
     if keep.sum() < 3:
-        return resample(points, at, s)
+        return resample(points, samples, s)
     spline = scipy.interpolate.CubicSpline(s[keep], points[keep])
-    return spline(np.minimum(at, s[-1]))
+    return spline(np.minimum(samples, s[-1]))
 
 
 def extended(points: F64, length_m: float) -> F64:

@@ -61,9 +61,9 @@ def time_fault(plan: Plan, now: int) -> str:
     """Check that times are integer microseconds, begin at the observation, increase, and reach far
     enough in fine enough steps.
     """
-    found = plan_problem(plan, now)
-    if found:
-        return found
+    problem = plan_problem(plan, now)
+    if problem:
+        return problem
     times = plan.times_us
     steps = np.diff(times)
     horizon_s = int(times[-1] - times[0]) * 1e-6
@@ -141,15 +141,17 @@ def speed_fault(fast: Plan, slow: Plan) -> str:
         begins_mps.append(math.hypot(x, y) / BEGIN_S)
     at_fast = begins_mps[0] / STRAIGHT.speed_mps
     at_slow = begins_mps[1] / SLOW_LEFT.speed_mps
-    where = f"at 10 m/s plans begin with {begins_mps[0]:.4g} m/s, at 4 m/s with {begins_mps[1]:.4g}"
+    observation = (
+        f"at 10 m/s plans begin with {begins_mps[0]:.4g} m/s, at 4 m/s with {begins_mps[1]:.4g}"
+    )
     unit = unit_guess(at_fast)
     if unit and unit_guess(at_slow) == unit:
-        return f"{where}: it looks like {unit}"
+        return f"{observation}: it looks like {unit}"
     is_one_factor = max(at_fast, at_slow) < 1.25 * min(at_fast, at_slow)
     if is_one_factor and not LEAST_SHARE < at_fast < MOST_SHARE:
-        return f"{where}: as if time steps or lengths were off by {at_fast:.2g}"
+        return f"{observation}: as if time steps or lengths were off by {at_fast:.2g}"
     if begins_mps[0] > MOST_MPS:
-        return f"{where}: a car does not reach that"
+        return f"{observation}: a car does not reach that"
     return ""
 
 
@@ -163,14 +165,14 @@ def _late(straight: Sequence[Plan], bent: Sequence[Plan]) -> int | None:
     return None
 
 
-def difference(one: Sequence[Plan], other: Sequence[Plan] | str) -> float:
+def difference(first: Sequence[Plan], other: Sequence[Plan] | str) -> float:
     """Return the largest difference of two drives' plans in metres or radians; infinite where times
     or shapes differ, or where the policy raised in the other one.
     """
-    if isinstance(other, str) or len(one) != len(other):
+    if isinstance(other, str) or len(first) != len(other):
         return float("inf")
     largest = 0.0
-    for p, q in zip(one, other, strict=True):
+    for p, q in zip(first, other, strict=True):
         if p.xy.shape != q.xy.shape or not np.array_equal(p.times_us, q.times_us):
             return float("inf")
         largest = max(largest, np.abs(p.xy - q.xy).max(), np.abs(p.yaw - q.yaw).max())
@@ -183,21 +185,21 @@ def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[Check]:
     probes = [("route_rig", STRAIGHT, ROUTE_LEFT)]
     if {one.name for one in IMAGES} <= plans.keys():
         probes.append(("images", NO_ROUTE, IMAGE_LEFT))
-    for what, straight, left in probes:
+    for source, straight, left in probes:
         late = _late(plans[straight.name], plans[left.name])
         if late is None:
-            found = f"a bend in {what} changed no plan within {STEPS - CHANGE} queries"
-            out.append(Check(what, True, found))
+            finding = f"a bend in {source} changed no plan within {STEPS - CHANGE} queries"
+            out.append(Check(source, True, finding))
         elif late > 0:
-            found = f"a bend in {what} changes the plan {late} queries late"
-            out.append(Check("lag", True, found))
+            finding = f"a bend in {source} changes the plan {late} queries late"
+            out.append(Check("lag", True, finding))
     last = plans[STANDING.name][-1]
     moves_m = float(np.hypot(*(last.xy[-1] - last.xy[0])))
-    found = f"from standstill on a free road it moves {moves_m:.1f} m within its horizon"
-    out.append(Check("standstill", True, found))
+    finding = f"from standstill on a free road it moves {moves_m:.1f} m within its horizon"
+    out.append(Check("standstill", True, finding))
     if not any(plan.samples for driven in plans.values() for plan in driven):
-        found = "it carries no sampled alternatives, so plan metrics see one trajectory"
-        out.append(Check("samples", True, found))
+        finding = "it carries no sampled alternatives, so plan metrics see one trajectory"
+        out.append(Check("samples", True, finding))
     return out
 
 
@@ -340,16 +342,16 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None) -> Repo
 
 
 def _checked(policy: Policy, scenario: Scenario) -> Report:
-    known = {camera.name: camera for camera in scenario.cameras}
+    rig = {camera.name: camera for camera in scenario.cameras}
     fault = sensors_problem(policy.sensors)
     if not fault:
         used = sorted({sensor.camera for sensor in policy.sensors})
-        unknown = [name for name in used if name not in known]
+        unknown = [name for name in used if name not in rig]
         if unknown:
-            fault = f"the policy asks for cameras {unknown}; the scenario has {sorted(known)}"
+            fault = f"the policy asks for cameras {unknown}; the scenario has {sorted(rig)}"
     if fault:
         return Report((Check("sensors", False, fault),))
-    cameras = {name: known[name] for name in used}
+    cameras = {name: rig[name] for name in used}
     checks = [Check("sensors", True, f"asks for {used or 'no camera'}")]
     replays = getattr(policy, "controller", "") == "perfect"
     situations = [STRAIGHT, OLD_FRAME]
@@ -361,13 +363,13 @@ def _checked(policy: Policy, scenario: Scenario) -> Report:
         driven = _drive(policy, situation, cameras, durations_ms)
         if not isinstance(driven, str):
             plans[situation.name] = driven
-            found = _plan_fault(situation, driven)
+            plan_check = _plan_fault(situation, driven)
         elif situation in IMAGES:  # a policy may need the route
             continue
         else:
-            found = Check("plans", False, f"in the situation {situation.name!r} {driven}")
-        if found is not None and found.name not in {check.name for check in checks}:
-            checks.append(found)
+            plan_check = Check("plans", False, f"in the situation {situation.name!r} {driven}")
+        if plan_check is not None and plan_check.name not in {check.name for check in checks}:
+            checks.append(plan_check)
     notes: tuple[Check, ...] = ()
     if all(check.ok for check in checks):
         straight = plans["straight"]
@@ -402,15 +404,15 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
 
     for step in range(situation.steps):
         now = START_US + step * STEP_US
-        shown = road
+        painted = road
         ahead = road
         if step >= CHANGE:
-            shown = road if situation.image_1pm is None else PaintedRoad(situation.image_1pm)
+            painted = road if situation.image_1pm is None else PaintedRoad(situation.image_1pm)
             ahead = road if situation.route_1pm is None else PaintedRoad(situation.route_1pm)
         frames = {}
         for name, camera in cameras.items():
             seen_us = now - situation.frame_age_us
-            rgb = shown.image(camera, shown.pose(along(seen_us)), seed=step)
+            rgb = painted.image(camera, painted.pose(along(seen_us)), seed=step)
             rgb = np.full_like(rgb, 128) if situation.is_blank else rgb
             frames[name] = read_only(Frame(seen_us, name, rgb))
         T_ahead_rig = ahead.pose(along(now))
@@ -450,8 +452,8 @@ def _drive(
     except BaseException as error:  # whatever a foreign policy raises is a result of the check
         if is_interruption(error):
             raise
-        said = raised(error, defined(policy, method))
-        return f"the policy raised in query {len(plans) + 1}: {said}"
+        message = raised(error, defined(policy, method))
+        return f"the policy raised in query {len(plans) + 1}: {message}"
     return plans
 
 

@@ -154,9 +154,9 @@ class LaneCamera(Policy):
         lab = cv2.cvtColor(ground, cv2.COLOR_RGB2LAB)
         not_road = None if self.road is None else anomaly(lab, self.road, self.grid)
         points, crosswalk = find_paint(ground, self.grid, self.ridges, not_road)
-        there = None if route is None else _points_in(route, pose_now, pose)
-        self._look_for_lane(points, there, speed)
-        path = extended(fuse(self.lane, there)[0], PATH_M)
+        route_points = None if route is None else _points_in(route, pose_now, pose)
+        self._look_for_lane(points, route_points, speed)
+        path = extended(fuse(self.lane, route_points)[0], PATH_M)
         centre_y = np.interp(self.grid.x_m, *_increasing(path))
         foot = None
         if not_road is not None:
@@ -200,30 +200,30 @@ class LaneCamera(Policy):
         `blend` sees to.
         """
         x, y = _increasing(route)
-        at = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
-        lateral_offset_m = float((np.interp(at, x, y) - lane.centre(at))[0])
+        probe = np.array([max(CHOOSE_AT_M, CHOOSE_AT_S * speed)])
+        lateral_offset_m = float((np.interp(probe, x, y) - lane.centre(probe))[0])
         turn = float(
-            np.arctan2(np.interp(at + 2, x, y) - np.interp(at - 2, x, y), 4.0)[0]
-            - np.arctan(lane.slope(at))[0]
+            np.arctan2(np.interp(probe + 2, x, y) - np.interp(probe - 2, x, y), 4.0)[0]
+            - np.arctan(lane.slope(probe))[0]
         )
         is_other_lane = (
             abs(lateral_offset_m) > OTHER_LANE * lane.mean[4]
             and abs(turn) < SAME_HEADING_RAD
-            and x[-1] > at[0] + 2
+            and x[-1] > probe[0] + 2
         )
         self.other_lane_frames = self.other_lane_frames + 1 if is_other_lane else 0
         if self.other_lane_frames < OTHER_LANE_FRAMES:
             return lane
         self.other_lane_frames = 0
-        found = search(
+        lane_found = search(
             points,
             row_m,
             float(lane.mean[0]) + lateral_offset_m,
             float(lane.mean[1]),
             float(lane.mean[2]),
         )
-        if found is not None:
-            return found
+        if lane_found is not None:
+            return lane_found
         lanes = round(lateral_offset_m / float(lane.mean[4]))
         return (
             shift(lane, lanes)
@@ -233,16 +233,16 @@ class LaneCamera(Policy):
 
     def _is_lost(self, lane: LaneState, route: RoutePrior | None) -> bool:
         if route is not None:
-            at = 6.0
-            turn = route.heading_rad + at * route.curvature_1pm - float(lane.slope(at))
+            ahead_m = 6.0
+            turn = route.heading_rad + ahead_m * route.curvature_1pm - float(lane.slope(ahead_m))
             if abs(turn) > TURN_OFF_RAD:
                 return True
             # Beside the route, a lane needs both borders: a single line is ambiguous.
             lateral_offset_m = (
                 route.offset_m
-                + at * route.heading_rad
-                + at**2 / 2 * route.curvature_1pm
-                - float(lane.centre(np.array([at]))[0])
+                + ahead_m * route.heading_rad
+                + ahead_m**2 / 2 * route.curvature_1pm
+                - float(lane.centre(np.array([ahead_m]))[0])
             )
             if (
                 abs(lateral_offset_m) > UNCERTAIN_M

@@ -139,15 +139,15 @@ def update(lane: LaneState, points: PaintPoints, row_m: F64) -> LaneState:
     rows = row_m[near]
     left = _length(x, rows, used & (side > 0))
     right = _length(x, rows, used & (side < 0))
-    seen = left + right > 2.0
-    far = float(np.percentile(x[used], 95)) if seen else lane.seen_to_m
+    is_seen = left + right > 2.0
+    far = float(np.percentile(x[used], 95)) if is_seen else lane.seen_to_m
     return LaneState(
         mean,
         np.asarray(np.linalg.inv(total)),
         left,
         right,
         max(far, 0.0),
-        0.0 if seen else lane.blind_m,
+        0.0 if is_seen else lane.blind_m,
     )
 
 
@@ -244,9 +244,9 @@ def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
 
 def _length(x: F64, rows: F64, used: Bool) -> float:
     """Return the metres of road over which at least one used point lies."""
-    at = x[used]
-    is_new = np.ones(len(at), bool)
-    np.not_equal(at[1:], at[:-1], out=is_new[1:])
+    used_rows = x[used]
+    is_new = np.ones(len(used_rows), bool)
+    np.not_equal(used_rows[1:], used_rows[:-1], out=is_new[1:])
     return float(rows[used][is_new].sum())
 
 

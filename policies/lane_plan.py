@@ -154,8 +154,8 @@ def idm_progress(
         else (float(obstacle.distance_m), max(float(obstacle.speed_mps), 0.0))
     )
     for t, dt in zip(t_s.tolist(), np.diff(t_s).tolist(), strict=False):
-        at = int(s / Path.SPACING_M)
-        limit = ahead[at if at < end else end]
+        sample = int(s / Path.SPACING_M)
+        limit = ahead[sample if sample < end else end]
         accel = IDM_ACCEL_MPS2 * (1 - (v / cruise) ** 4) if v < limit else (limit - v) / 0.5
         accel = max(min(accel, (limit - v) / dt), -4.0)
         if obstacle is not None:
@@ -222,14 +222,14 @@ def sampled(xy: F64, yaw: F64, noise: F64, sigma_m: float) -> list[F64]:
     ]
 
 
-def _retimed(lines: F64, s: F64, at: F64) -> F64:
-    """Return ``lines`` (K, T, 3) at progress ``at`` (K, T), straight on beyond the end; a standing
+def _retimed(lines: F64, s: F64, progress: F64) -> F64:
+    """Return ``lines`` (K, T, 3) at progress ``progress`` (K, T), straight on beyond the end; a standing
     plan is unchanged.
 
     Args:
         lines: Rows at progress ``s``.
         s: ``(T,)``.
-        at: Progress of each line.
+        progress: Progress of each line.
     """
     if s[-1] < 0.1:
         return lines
@@ -239,8 +239,8 @@ def _retimed(lines: F64, s: F64, at: F64) -> F64:
     out = np.empty_like(lines)
     for k in range(len(lines)):
         for d in range(3):
-            out[k, :, d] = np.interp(at[k], knots, kept[k, :, d])
-    over = np.maximum(at - s[-1], 0.0)
+            out[k, :, d] = np.interp(progress[k], knots, kept[k, :, d])
+    over = np.maximum(progress - s[-1], 0.0)
     end = lines[:, -1:, 2]
     out[..., 0] += over * np.cos(end)
     out[..., 1] += over * np.sin(end)

@@ -112,9 +112,9 @@ class Learned(Policy):
         self.step = self.step + 1
         self.acted_us = observation.t_us
         lateral_m, share = self.temperature * np.minimum(sigma, [MAX_SIGMA_M, MAX_SIGMA_SPEED])
-        drawn = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
+        noise = np.concatenate([np.zeros((1, 2)), self.noise * [1.0, share / NOISE_SPEED]])
         plans = (
-            sampled(xy, yaw, drawn, float(lateral_m))[1:]
+            sampled(xy, yaw, noise, float(lateral_m))[1:]
             if self.temperature
             else [np.column_stack([xy, yaw])] * N_SAMPLES
         )

@@ -138,9 +138,9 @@ def _project(camera: CameraSpec, T_camera_rig: F64, points: F64) -> F64:
     """Return pixel coordinates (N, 2) of rig points (N, 3); pixel centres at integers. NaN behind
     the camera.
     """
-    at = points @ T_camera_rig[:3, :3].T + T_camera_rig[:3, 3]
-    z = np.where(at[:, 2] > 0.1, at[:, 2], np.nan)
-    uvw = at @ camera.K.T
+    points_camera = points @ T_camera_rig[:3, :3].T + T_camera_rig[:3, 3]
+    z = np.where(points_camera[:, 2] > 0.1, points_camera[:, 2], np.nan)
+    uvw = points_camera @ camera.K.T
     return uvw[:, :2] / z[:, None] - 0.5
 
 
@@ -283,11 +283,11 @@ def find_paint(
     inner = (cols > 0) & (cols < smooth.shape[1] - 1)
     rows = rows[inner]
     cols = cols[inner]
-    before, here, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
-    bend = np.maximum(2 * here - before - after, 1e-6)
+    before, centre, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
+    bend = np.maximum(2 * centre - before - after, 1e-6)
     shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
     y = grid.y_m[cols] - shift * CELL_M
-    strength = here / threshold[rows]
+    strength = centre / threshold[rows]
     # A bar of a crosswalk has at least two others beside it, closer than a lane width.
     apart = np.abs(y[:, None] - y[None, :])
     beside = (rows[:, None] == rows[None, :]) & (apart > BAR_M[0]) & (apart < BAR_M[1])

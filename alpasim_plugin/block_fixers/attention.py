@@ -165,8 +165,8 @@ def block_causal_attention(
         end = min(start + block_latents, frames)
         first = 0 if window is None else max(0, min(start, end - (window - sink)))
         sinks = slice(0, min(sink, first) * tokens)  # those before the contiguous range
-        seen = slice(first * tokens, end * tokens)
-        keys, values = (torch.cat([part[:, sinks], part[:, seen]], dim=1) for part in (k, v))
+        visible = slice(first * tokens, end * tokens)
+        keys, values = (torch.cat([part[:, sinks], part[:, visible]], dim=1) for part in (k, v))
         out.append(attend(q[:, start * tokens : end * tokens], keys, values))
     return torch.cat(out, dim=1)
 

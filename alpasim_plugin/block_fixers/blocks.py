@@ -43,8 +43,8 @@ class LowRankModulation(nn.Sequential):
             emb: ``(B, T, width)``, the normalised sinusoid.
             lora: ``(B, T, 3 * width)``, of which the first ``parts * width`` are added.
         """
-        both = self(emb) + lora[..., : self.parts * emb.shape[-1]]
-        return both[:, :, None].chunk(self.parts, dim=-1)
+        modulation = self(emb) + lora[..., : self.parts * emb.shape[-1]]
+        return modulation[:, :, None].chunk(self.parts, dim=-1)
 
 
 def residual(
@@ -112,12 +112,12 @@ class Block(nn.Module):
             opacity: ``(B, opacity_channels, T, H, W)`` for a block that embeds it: added to the
                 modulated input of self-attention.
         """
-        seen = None
+        opacity_embedding = None
         if self.opacity_embed is not None and opacity is not None:
-            seen = self.opacity_embed.embed(opacity)
+            opacity_embedding = self.opacity_embed.embed(opacity)
         x = residual(
             x,
-            lambda n: self.self_attn(n, table, attention, seen),
+            lambda n: self.self_attn(n, table, attention, opacity_embedding),
             self.adaln_modulation_self_attn,
             time,
         )

@@ -189,10 +189,10 @@ class CosmosCausalDiT(nn.Module):
             ``(B, C, T, H, W)`` velocity; without gradients unless the cache keeps them.
         """
         self._check(x_block, hdmap_block)
-        found = [cache.batch, cache.height, cache.width, cache.rope]
-        if found != [x_block.shape[0], x_block.shape[3], x_block.shape[4], self.rope]:
+        cache_sizes = [cache.batch, cache.height, cache.width, cache.rope]
+        if cache_sizes != [x_block.shape[0], x_block.shape[3], x_block.shape[4], self.rope]:
             raise InputError(
-                f"a cache for batch and sizes {found[:3]}: another is needed",
+                f"a cache for batch and sizes {cache_sizes[:3]}: another is needed",
                 "make it with this network's new_cache for this batch and latent size",
             )
         with torch.set_grad_enabled(torch.is_grad_enabled() and cache.keeps_graph):

@@ -98,11 +98,11 @@ class RollingCache(BlockCache):
         """
         table = super().begin(latents)
         ring = self.window - self.sink
-        own = range(self.filled, self.filled + latents)
-        rolling = [i for i in own if i >= self.sink]
+        block_rows = range(self.filled, self.filled + latents)
+        rolling = [i for i in block_rows if i >= self.sink]
         self._fits = len(rolling) <= ring  # whether the open block fits in the window
         # A block longer than the ring attends to all of itself; only its newest latents are cached.
-        kept = [i for i in own if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
+        kept = [i for i in block_rows if i < self.sink] + rolling[max(0, len(rolling) - ring) :]
         slots = [i if i < self.sink else self.sink + (i - self.sink) % ring for i in kept]
         self._rows = self._token_rows(slots)
         self._source = self._token_rows([i - self.filled for i in kept])
@@ -110,18 +110,20 @@ class RollingCache(BlockCache):
 
     def attend(self, layer: int, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         """Write the block's keys and values into their slots and attend to the buffer."""
-        own = torch.stack([k, v])
+        block_keys_values = torch.stack([k, v])
         if layer not in self.buffers:
             with torch.inference_mode(False):
                 slots = self.window * self.tokens
-                self.buffers[layer] = torch.zeros_like(own[:, :, :1]).repeat(1, 1, slots, 1, 1)
+                self.buffers[layer] = torch.zeros_like(block_keys_values[:, :, :1]).repeat(
+                    1, 1, slots, 1, 1
+                )
         buffer = self.buffers[layer]
-        buffer.index_copy_(2, self._rows, own[:, :, self._source])
+        buffer.index_copy_(2, self._rows, block_keys_values[:, :, self._source])
         if self._fits:
             end = min(self.window, self.filled + self.open_latents) * self.tokens
             return attend(q, *buffer[:, :, :end])
         past = min(self.sink, self.filled) * self.tokens
-        return attend(q, *torch.cat([buffer[:, :, :past], own], dim=2))
+        return attend(q, *torch.cat([buffer[:, :, :past], block_keys_values], dim=2))
 
     def _token_rows(self, latents: list[int]) -> Tensor:
         first = upload(torch.tensor(latents, dtype=torch.long), self.device)[:, None] * self.tokens

@@ -95,10 +95,10 @@ def streaming_dit(
     """
     net = CosmosCausalDiT.from_state_dict(weights, settings.rope_ratios, source=source)
     expected = condition_sizes(settings)
-    found = {key: getattr(net.sizes, key) for key in expected}
-    if found != expected:
+    sizes = {key: getattr(net.sizes, key) for key in expected}
+    if sizes != expected:
         raise InputError(
-            f"{source}: {found}, streaming gives {expected}",
+            f"{source}: {sizes}, streaming gives {expected}",
             "set fixer.render_input and fixer.opacity_input as in its training; its bundle has them",
         )
     return net
@@ -137,8 +137,8 @@ def decode(
     Returns:
         Frames like ``render``, not clipped to [-1, 1], and the decoder's state after them.
     """
-    seen = {"render": render, "opacity": opacity} if settings.shows_render else {}
-    return networks.decoder.decode_next(z, state, clamp=False, **seen)
+    guidance = {"render": render, "opacity": opacity} if settings.shows_render else {}
+    return networks.decoder.decode_next(z, state, clamp=False, **guidance)
 
 
 @lru_cache(maxsize=4)
@@ -243,9 +243,9 @@ class Parts:
         if untrained == "refuse" or (untrained == "identity" and not is_identity):
             self.refuse(part, f"no weights, and settings.untrained is {untrained!r}")
 
-    def refuse(self, part: str, found: str) -> None:
+    def refuse(self, part: str, problem: str) -> None:
         """Raise the error for weights that are missing."""
         raise InputError(
-            f"{self.settings.name}, weights.{part}: {found}",
+            f"{self.settings.name}, weights.{part}: {problem}",
             weights_to_give(part, self.settings.trained_by),
         )

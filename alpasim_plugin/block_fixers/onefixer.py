@@ -114,8 +114,8 @@ class OneFixer(Fixer):
         self.pipeline = BlockPipeline(self.networks, settings)
         self.blocks = BlockRule.of_latents(settings.block_latents)
         self.trained = self.networks.trained
-        at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
-        self.label = f"{settings.name}{at}, {self.networks.note}"
+        step_suffix = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
+        self.label = f"{settings.name}{step_suffix}, {self.networks.note}"
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -145,15 +145,15 @@ class OneFixer(Fixer):
         views = group_views(
             block, maps if self.settings.uses_map else (), self.blocks.frames(self._done)
         )
-        given, known = (
+        layout, first_layout = (
             [(part.cameras, part.shape) for part in parts] for parts in (views, self._history)
         )
-        if given != known and not self._done:
+        if layout != first_layout and not self._done:
             self._history = tuple(self._open(view) for view in views)
             self._pending = ()
-        elif given != known:
+        elif layout != first_layout:
             raise InputError(
-                f"block {self._done}: cameras and sizes {given} after {known}",
+                f"block {self._done}: cameras and sizes {layout} after {first_layout}",
                 "give the same cameras at the same sizes in every block, or reset",
             )
         pending = [block.views for block in self._pending]
@@ -166,8 +166,8 @@ class OneFixer(Fixer):
             )
         out = list(block)
         for fixed in self._pending:
-            for b, mine in enumerate(fixed.views.index):
-                for t, i in enumerate(mine):
+            for b, indices in enumerate(fixed.views.index):
+                for t, i in enumerate(indices):
                     event = fixed.events[b][t]
                     out[i] = (
                         replace(block[i], events=(*block[i].events, event))
@@ -197,10 +197,10 @@ class OneFixer(Fixer):
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
         first = history.state.latent
         latents = range(first, first + self.settings.block_latents)
-        drawn = latent_noise(
+        noise_arrays = latent_noise(
             self.scene_id, self.seed, view.cameras, self.pipeline.draws, latents, shape
         )
-        noise = [upload(eps, self.networks.device) for eps in drawn]
+        noise = [upload(eps, self.networks.device) for eps in noise_arrays]
         video, state = self.pipeline.run(history.state, clip.rgb, clip.alpha, clip.maps, noise)
         video = crop_clip(video, view.size)
         images = to_images(video, view.size)

@@ -121,12 +121,12 @@ class BlockPipeline:
         settings = self.settings
         nets = self.networks
         is_first = state.latent == 0
-        shown = map_video(settings, rgb, sdmap)
-        views = rgb if shown is None else torch.cat([rgb, shown])
+        map_frames = map_video(settings, rgb, sdmap)
+        views = rgb if map_frames is None else torch.cat([rgb, map_frames])
         latents, encoder = nets.vae.encode_next(views, state.encoder)
         z_render = latents[: len(rgb)].float()
         z_map = latents[len(rgb) :].float()
-        if shown is None:
+        if map_frames is None:
             z_map = torch.zeros_like(z_render)
         sources = list(noise[: len(self.schedule)])
         if settings.holes == "render":

@@ -59,19 +59,23 @@ def deviation(predicted: RenderRequest, true: RenderRequest) -> Deviation:
     before = predicted.T_world_camera
     now = true.T_world_camera
     moved = float(np.linalg.norm(before[:, :3, 3] - now[:, :3, 3], axis=1).max())
-    turned = max(rotation_rad(one, two) for one, two in zip(before, now, strict=True))
+    turned = max(
+        rotation_rad(predicted_pose, two) for predicted_pose, two in zip(before, now, strict=True)
+    )
     actors = [0.0]
     for key in predicted.actors.keys() | true.actors.keys():
-        one = predicted.actors.get(key)
+        predicted_pose = predicted.actors.get(key)
         two = true.actors.get(key)
         latest = predicted.actors[key] if two is None else two
         ray = latest[:3, 3] - now[-1, :3, 3]
         if float(ray @ now[-1, :3, 2]) < -BEHIND_M:
             continue
-        if one is None or two is None:
+        if predicted_pose is None or two is None:
             actors.append(math.inf)
             continue
-        apart = float(np.linalg.norm(one[:3, 3] - two[:3, 3])) + ARM_M * rotation_rad(one, two)
+        apart = float(np.linalg.norm(predicted_pose[:3, 3] - two[:3, 3])) + ARM_M * rotation_rad(
+            predicted_pose, two
+        )
         actors.append(apart * NEAR_M / max(NEAR_M, float(np.linalg.norm(ray))))
     return Deviation(moved, math.degrees(turned), max(actors))
 
@@ -101,8 +105,8 @@ class SpeculationStats:
     def as_dict(self) -> dict[str, Any]:
         """Return the counts and errors, in metres and degrees."""
         forecast = _rounded(vars(self.forecast_error)) if self.predicted else {}
-        shown = _rounded(vars(self.shown_error))
-        return vars(self) | {"forecast_error": forecast, "shown_error": shown}
+        shown_error = _rounded(vars(self.shown_error))
+        return vars(self) | {"forecast_error": forecast, "shown_error": shown_error}
 
 
 class SpeculativeRenderer(FixedRenderer):
@@ -149,7 +153,7 @@ class SpeculativeRenderer(FixedRenderer):
         ]
         limits = self.settings.tolerance_m, self.settings.tolerance_deg
         is_hit = bool(predicted) and all(error.within(*limits) for error in forecasts)
-        shown = [EXACT] * len(ordered)
+        shown_errors = [EXACT] * len(ordered)
         if place + 1 == self.fixer.blocks.frames(self.stats.blocks):
             # The block of true poses joins the history; its last frames are shown.
             fixed = self._fix(self.fixer.step, self.true)
@@ -159,7 +163,7 @@ class SpeculativeRenderer(FixedRenderer):
             frames = fixed[-1]
         elif is_hit:
             frames = [frame for _, frame in predicted]
-            shown = forecasts
+            shown_errors = forecasts
         else:
             # A draft: the true frames so far with the predicted rest of the block.
             left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
@@ -177,9 +181,9 @@ class SpeculativeRenderer(FixedRenderer):
         self.stats.predicted += len(forecasts)
         self.stats.hits += len(ordered) if is_hit else 0
         self.stats.forecast_error = self.stats.forecast_error.largest(forecasts)
-        self.stats.shown_error = self.stats.shown_error.largest(shown)
+        self.stats.shown_error = self.stats.shown_error.largest(shown_errors)
         made = {
-            frame.camera: _measured(frame, shown[i], forecasts[i] if forecasts else None)
+            frame.camera: _measured(frame, shown_errors[i], forecasts[i] if forecasts else None)
             for i, frame in enumerate(frames)
         }
         return [made[request.camera.name] for request in requests]
@@ -208,9 +212,9 @@ class SpeculativeRenderer(FixedRenderer):
         self.last_us = times[0]
 
 
-def _measured(frame: Frame, shown: Deviation, forecast: Deviation | None) -> Frame:
+def _measured(frame: Frame, shown_error: Deviation, forecast: Deviation | None) -> Frame:
     """Add the pose errors of the frame shown and of the forecast to its facts."""
-    facts = {"pose_error_m": shown.camera_m}
+    facts = {"pose_error_m": shown_error.camera_m}
     if forecast is not None:
         facts["forecast_error_m"] = forecast.camera_m
     return replace(frame, facts={**frame.facts, **_rounded(facts)})

@@ -163,14 +163,14 @@ class TinyVAE(StreamingCodec):
         parts = [torch.split(z.float(), latents, dim=2)]
         if render is not None:
             cover = torch.ones_like(render[:, :1]) if opacity is None else opacity
-            for given, channels in ((render, COLOURS), (cover, 1)):
+            for guide, channels in ((render, COLOURS), (cover, 1)):
                 expected = [b, channels, sum(frames), h * SIDE, w * SIDE]
-                if list(given.shape) != expected:
+                if list(guide.shape) != expected:
                     raise InputError(
-                        f"a render or opacity of shape {list(given.shape)}",
+                        f"a render or opacity of shape {list(guide.shape)}",
                         f"give that of the frames that come out, {expected}",
                     )
-                parts.append(torch.split(given.float(), frames, dim=2))
+                parts.append(torch.split(guide.float(), frames, dim=2))
         video, state = in_passes(self._decode_pass, state, zip(*parts, strict=True))
         return video.clamp(-1, 1) if clamp else video, state
 
@@ -180,8 +180,8 @@ class TinyVAE(StreamingCodec):
         mu = self.transform.analyse(grid) + self.encoder.next(grid.to(self.dtype), streaming)
         return self.stats.normalise(channels_first(mu)).to(self.dtype), streaming.state
 
-    def _decode_pass(self, state: State | None, z: Tensor, *shown: Tensor) -> tuple[Tensor, State]:
-        """Decode latents; ``shown`` is the render and its opacity, or nothing."""
+    def _decode_pass(self, state: State | None, z: Tensor, *guides: Tensor) -> tuple[Tensor, State]:
+        """Decode latents; ``guides`` is the render and its opacity, or nothing."""
         streaming = StreamingState(state)
         mu = channels_last(self.stats.denormalise(z))
         grid = self.transform.synthesise(mu)
@@ -191,13 +191,13 @@ class TinyVAE(StreamingCodec):
             return channels_to_frames(x, GROUP)[:, skipped:]
 
         condition = None
-        if shown:
-            render, cover = (to_grid(whole_groups(part, streaming.first)) for part in shown)
+        if guides:
+            render, cover = (to_grid(whole_groups(part, streaming.first)) for part in guides)
             colours = as_frames(_per_pixel(render, cover).to(self.dtype))
             condition = colours, as_frames(cover.to(self.dtype))
         correction, gate = self.decoder.next(mu.to(self.dtype), condition, streaming)
         image = as_frames(grid) + correction
-        if shown:
+        if guides:
             detail = as_frames(self.transform.residue(_per_pixel(render - grid, cover)))
             image = image + _per_pixel(detail, gate.float())
         return from_grid(image).to(self.dtype), streaming.state

@@ -198,12 +198,12 @@ class Upsample(nn.Module):
         if self.time_conv is not None:
             first = 1 if streaming.first else 0
             alone = x[:, :first]
-            rest = x[:, first:]
-            if rest.shape[1]:
-                rest = channels_to_frames(self.time_conv.next(rest, streaming), 2)
+            following = x[:, first:]
+            if following.shape[1]:
+                following = channels_to_frames(self.time_conv.next(following, streaming), 2)
             else:
                 streaming.extend(
-                    rest, TAPS - 1
+                    following, TAPS - 1
                 )  # only the first latent: cache an empty history, so that the slot exists
-            x = torch.cat([alone, rest], dim=1)
+            x = torch.cat([alone, following], dim=1)
         return run_layers(self.resample, x, streaming)

@@ -172,9 +172,9 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
             whole = _covered(camera, rays, weight > 0, side, turn)
             assert whole.resample is not None, "a pinhole that covers a lens"
             share = weight.astype(np.float32).reshape(camera.height, camera.width)
-            own = np.flatnonzero(share.any(axis=0))
-            first = int(own[0])
-            end = int(own[-1]) + 1
+            covered_columns = np.flatnonzero(share.any(axis=0))
+            first = int(covered_columns[0])
+            end = int(covered_columns[-1]) + 1
             place, share = (
                 np.ascontiguousarray(part[:, first:end]) for part in (whole.resample, share)
             )
@@ -257,22 +257,24 @@ def joined_image(
         return out
     shape = sides[0].height, sides[0].width
     out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
-    shown = np.zeros(shape, np.float32)
+    weight_sum = np.zeros(shape, np.float32)
     end = 0  # of the columns that a pinhole before has filled
     for lens, image in zip(sides, images, strict=True):
         assert lens.weight is not None, "one of several pinholes"
         part = lens.shown(image)
         weight = lens.weight * (part[..., 3] + NOT_HELD) if holds else lens.weight
-        both = max(0, end - lens.first_column)
-        if both:
-            given = out[lens.part], part, shown[lens.part], weight
-            mixed = cv2.blendLinear(*(np.ascontiguousarray(image[:, :both]) for image in given))
-            part[:, :both] = mixed
+        overlap = max(0, end - lens.first_column)
+        if overlap:
+            operands = out[lens.part], part, weight_sum[lens.part], weight
+            mixed = cv2.blendLinear(
+                *(np.ascontiguousarray(image[:, :overlap]) for image in operands)
+            )
+            part[:, :overlap] = mixed
         out[lens.part] = part
-        shown[lens.part] += weight
+        weight_sum[lens.part] += weight
         end = max(end, lens.part[1].stop)
-    if cv2.countNonZero(shown) < shown.size:
-        out[shown == 0] = outside
+    if cv2.countNonZero(weight_sum) < weight_sum.size:
+        out[weight_sum == 0] = outside
     return out
 
 
@@ -301,7 +303,7 @@ def rays_of(camera: CameraSpec) -> Rays:
     offset = np.stack([x, y], axis=-1).reshape(-1, 2) - K[:2, 2]
     focal = float(K[0, 0]), float(K[1, 1])
     if lens.kind == "opencv":
-        plane, seen = _undistorted(offset / focal, lens, focal)
+        plane, visible = _undistorted(offset / focal, lens, focal)
         ray = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
     else:
         plane = (
@@ -310,15 +312,15 @@ def rays_of(camera: CameraSpec) -> Rays:
         radius = np.linalg.norm(plane, axis=1)
         if lens.pixel_to_angle:
             angle = _value(lens.pixel_to_angle, radius)
-            seen = (angle >= 0) & (angle <= _limit(lens))
+            visible = (angle >= 0) & (angle <= _limit(lens))
         else:
-            angle, seen = _inverse(_radius_of_angle(lens), radius, _limit(lens), camera.name)
+            angle, visible = _inverse(_radius_of_angle(lens), radius, _limit(lens), camera.name)
         across = plane / np.maximum(radius, 1e-12)[:, None] * np.sin(angle)[:, None]
         ray = np.concatenate([across, np.cos(angle)[:, None]], axis=1)
         if lens.kind == "ftheta":
             focal = _ftheta_focal(lens), _ftheta_focal(lens)
-    _require(bool(seen.any()), camera.name, "a lens that sees nothing at this size")
-    return Rays(ray, seen, focal)
+    _require(bool(visible.any()), camera.name, "a lens that sees nothing at this size")
+    return Rays(ray, visible, focal)
 
 
 def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
@@ -356,19 +358,21 @@ def place_in_lens(camera: CameraSpec, pinhole: Lens) -> tuple[F32, Bool]:
     width, height = pinhole.cover
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     plane = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(pinhole.K).T
-    pixel, shown = pixels_of(camera, plane @ pinhole.T_lens_pinhole[:3, :3].T)
+    pixel, is_visible = pixels_of(camera, plane @ pinhole.T_lens_pinhole[:3, :3].T)
     place = (pixel - 0.5).astype(np.float32).reshape(height, width, 2)
-    return place, shown.reshape(height, width)
+    return place, is_visible.reshape(height, width)
 
 
 def lens_shares(camera: CameraSpec, pinhole: Lens, along: Along, backwards: bool) -> F32:
     """Return when each pixel of a covering pinhole is exposed: the share of the shutter of the
     lens's row (or column) that shows it; NaN where none does. See `shutter.Exposure`.
     """
-    place, shown = place_in_lens(camera, pinhole)
-    count, at = (camera.height, place[..., 1]) if along == "rows" else (camera.width, place[..., 0])
-    share = np.clip(at / max(count - 1, 1), 0, 1) if count > 1 else np.ones_like(at)
-    near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    place, is_visible = place_in_lens(camera, pinhole)
+    count, position = (
+        (camera.height, place[..., 1]) if along == "rows" else (camera.width, place[..., 0])
+    )
+    share = np.clip(position / max(count - 1, 1), 0, 1) if count > 1 else np.ones_like(position)
+    near = cv2.dilate(is_visible.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return np.where(near, 1 - share if backwards else share, np.float32(np.nan)).astype(np.float32)
 
 
@@ -454,8 +458,8 @@ def _checked(camera: CameraSpec) -> tuple[LensModel, F64]:
 
 def _ftheta_focal(lens: LensModel) -> float:
     """Return pixels per radian on the axis; 0 where the polynomial does not grow there."""
-    given = lens.pixel_to_angle or lens.coefficients
-    slope = given[1] if len(given) > 1 else 0.0
+    polynomial = lens.pixel_to_angle or lens.coefficients
+    slope = polynomial[1] if len(polynomial) > 1 else 0.0
     if slope <= 0:
         return 0.0
     return 1 / slope if lens.pixel_to_angle else slope
@@ -495,25 +499,25 @@ def _inverse(polynomial: F64, values: F64, limit: float, name: str) -> tuple[F64
     where there is a solution.
     """
     table = np.linspace(0.0, limit, TABLE)
-    there = _value(polynomial, table)
-    falls = np.flatnonzero(np.diff(there) <= 0)
+    table_values = _value(polynomial, table)
+    falls = np.flatnonzero(np.diff(table_values) <= 0)
     last = int(falls[0]) if len(falls) else TABLE - 1
     _require(last > 0, name, "a polynomial that does not grow from the axis")
-    x = np.interp(values, there[: last + 1], table[: last + 1])
+    x = np.interp(values, table_values[: last + 1], table[: last + 1])
     slope = np.polynomial.polynomial.polyder(polynomial)
     for _ in range(3):  # Newton, from within half a table step
         step = (_value(polynomial, x) - values) / np.maximum(_value(slope, x), 1e-9)
         x = np.clip(x - step, 0.0, table[last])
-    return x, (values >= there[0]) & (values <= there[last])
+    return x, (values >= table_values[0]) & (values <= table_values[last])
 
 
 def _distorted(xy: F64, lens: LensModel) -> F64:
     """Distort ideal image points ``(N, 2)`` by OpenCV's rational, tangential and thin prism terms
     (calib3d documentation).
     """
-    given = np.zeros(12)
-    given[: len(lens.coefficients)] = lens.coefficients
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = given
+    coefficients = np.zeros(12)
+    coefficients[: len(lens.coefficients)] = lens.coefficients
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = coefficients
     x, y = xy.T
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -528,8 +532,8 @@ def _opencv_reach(camera: CameraSpec) -> float:
     x, y = np.meshgrid(np.linspace(0, camera.width, 65), np.linspace(0, camera.height, 65))
     offset = np.stack([x, y], axis=-1).reshape(-1, 2) - camera.K[:2, 2]
     focal = float(camera.K[0, 0]), float(camera.K[1, 1])
-    plane, seen = _undistorted(offset / focal, camera.lens, focal)
-    return 1.05 * float(np.linalg.norm(plane[seen], axis=1).max(initial=0.0))
+    plane, converged = _undistorted(offset / focal, camera.lens, focal)
+    return 1.05 * float(np.linalg.norm(plane[converged], axis=1).max(initial=0.0))
 
 
 def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tuple[F64, Bool]:
@@ -554,14 +558,16 @@ def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tup
     return xy, missed < CLOSE_PX
 
 
-def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str, turn: F64 = np.eye(3)) -> Lens:
+def _covered(
+    camera: CameraSpec, rays: Rays, covered: Bool, side: str, turn: F64 = np.eye(3)
+) -> Lens:
     """Return the pinhole that shows some of a lens's pixels; ``turn`` has its axes as columns."""
     local = rays.ray @ turn
     xy = np.divide(
         local[:, :2], local[:, 2:], where=local[:, 2:] > 0.05, out=np.zeros_like(local[:, :2])
     )
-    low = xy[mine].min(0)
-    high = xy[mine].max(0)
+    low = xy[covered].min(0)
+    high = xy[covered].max(0)
     size = (high - low) * rays.focal
     shrink = min(1.0, float(np.sqrt(MAX_COVER_PX / max(size[0] * size[1], 1.0))))
     fx = rays.focal[0] * shrink
@@ -573,11 +579,11 @@ def _covered(camera: CameraSpec, rays: Rays, mine: Bool, side: str, turn: F64 = 
     T = np.eye(4)
     T[:3, :3] = turn
     shape = camera.height, camera.width
-    seen = None if mine.all() else mine.reshape(shape)
+    visible = None if covered.all() else covered.reshape(shape)
     place = place.reshape(*shape, 2)
-    return Lens(camera.width, camera.height, K, cover, place, seen, T_lens_pinhole=T, side=side)
+    return Lens(camera.width, camera.height, K, cover, place, visible, T_lens_pinhole=T, side=side)
 
 
-def _require(fine: bool, name: str, found: str) -> None:
+def _require(fine: bool, name: str, problem: str) -> None:
     if not fine:
-        raise InputError(f"camera {name!r}: {found}", DO_THIS)
+        raise InputError(f"camera {name!r}: {problem}", DO_THIS)

@@ -128,13 +128,13 @@ def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:
     part = np.full(share.shape, -1, np.int32)
     np.minimum(share * count, count - 1, out=part, where=~np.isnan(share), casting="unsafe")
     for index in range(count):
-        mine = part == index
-        if not mine.any():
+        in_band = part == index
+        if not in_band.any():
             continue
-        rows = extent(mine.any(axis=1), height)
-        columns = extent(mine.any(axis=0), width)
-        window = np.broadcast_to(mine, (height, width))[rows, columns]
-        within = share[mine]
+        rows = extent(in_band.any(axis=1), height)
+        columns = extent(in_band.any(axis=0), width)
+        window = np.broadcast_to(in_band, (height, width))[rows, columns]
+        within = share[in_band]
         T, actors = at_share(request, (float(within.min()) + float(within.max())) / 2)
         yield Band(rows, columns, None if window.all() else window, T, actors)
 
@@ -145,8 +145,8 @@ def extent(used: Bool, size: int) -> slice:
     """
     if len(used) == 1:
         return slice(0, size)
-    at = np.flatnonzero(used)
-    return slice(int(at[0]), int(at[-1]) + 1)
+    places = np.flatnonzero(used)
+    return slice(int(places[0]), int(places[-1]) + 1)
 
 
 def at_share(request: RenderRequest, share: float) -> tuple[F64, dict[str, F64]]:
@@ -200,8 +200,8 @@ def motion_px(request: RenderRequest) -> float:
             transform_points(inverse(T), points) for T, points in ((start, first), (end, last))
         )
         near_m = np.maximum(np.linalg.norm(after, axis=1) - USER_M, NEAR_M)
-        seen = after[:, 2] > -USER_M
-        moves.append(np.where(seen, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
+        in_front = after[:, 2] > -USER_M
+        moves.append(np.where(in_front, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
     return float(max(K[0, 0], K[1, 1]) * max(float(np.max(move)) for move in moves))
 
 

@@ -62,22 +62,22 @@ def read_transforms(path: Path) -> tuple[CameraSpec, ...]:
     return tuple(cameras.values())
 
 
-def _camera(document: JsonObject, where: str) -> CameraSpec:
-    frame = as_shape(_Frame, document, where, DO_THIS)
+def _camera(document: JsonObject, location: str) -> CameraSpec:
+    frame = as_shape(_Frame, document, location, DO_THIS)
     kind: Literal["opencv", "fisheye"] = (
         "fisheye" if frame.get("camera_model") == "OPENCV_FISHEYE" else "opencv"
     )
     coefficients = [document.get(key, 0.0) for key in COEFFICIENTS[kind]]
-    bent = tuple(as_shape(list[float], coefficients, f"{where}, coefficients", DO_THIS))
+    bent = tuple(as_shape(list[float], coefficients, f"{location}, coefficients", DO_THIS))
     pose = frame["transform_matrix"]
     if [len(row) for row in pose] != [4, 4, 4, 4]:
-        raise InputError(f"{where}, transform_matrix: not 4 x 4", DO_THIS)
+        raise InputError(f"{location}, transform_matrix: not 4 x 4", DO_THIS)
     T_rig_camera = np.array(pose, np.float64) * FLIPS[frame["axes"]]
     rotation = T_rig_camera[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (off < ROTATION_ERROR and np.linalg.det(rotation) > 0):
         raise InputError(
-            f"{where}, transform_matrix: its first three columns are no rotation (off by {off:.2g})",
+            f"{location}, transform_matrix: its first three columns are no rotation (off by {off:.2g})",
             "give a rigid transform from the camera to the rig",
         )
     K = intrinsics(*(frame[name] for name in ("fl_x", "fl_y", "cx", "cy")))

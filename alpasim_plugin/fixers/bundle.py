@@ -173,12 +173,12 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
     wrong = []
     others = []
     for key in (*kind.must_match, *kind.may_differ):
-        found = _at(used, key)
+        actual = _at(used, key)
         due = _at({**defaults, **trained_with}, key)
-        if due != found and key in kind.must_match:
-            wrong.append(f"{key} is {found} for {due}")
-        elif due != found:
-            others.append(f"{key} {found} instead of {due}")
+        if due != actual and key in kind.must_match:
+            wrong.append(f"{key} is {actual} for {due}")
+        elif due != actual:
+            others.append(f"{key} {actual} instead of {due}")
     if wrong:
         raise InputError(
             f"{path} with the settings of {settings.name}: {'; '.join(wrong)}",
@@ -202,8 +202,8 @@ def parts_of(tensors: Mapping[str, Tensor]) -> dict[str, StateDict]:
     """Group tensors by the part of their keys before the first dot; keys lose it."""
     parts: dict[str, StateDict] = {}
     for key, value in tensors.items():
-        part, _, rest = key.partition(".")
-        parts.setdefault(part, {})[rest] = value
+        part, _, inner_key = key.partition(".")
+        parts.setdefault(part, {})[inner_key] = value
     return parts
 
 

@@ -139,7 +139,7 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     )
     users = Users(*boxes)
     on_ground = _ground_depth(planes, rays, flat, users)
-    shown = Shown(_stacked([image.rgb for image in images]), sizes_px, from_view)
+    recorded = Shown(_stacked([image.rgb for image in images]), sizes_px, from_view)
     surfaces, hidden = (
         _stacked([part[None] for part in parts])[:, 0]
         for parts in zip(*((image.depth, image.hidden) for image in images), strict=True)
@@ -147,16 +147,16 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     by_depth, by_ground = (
         _filled(part, lenses).reshape(len(views), -1, height, width, 4)
         for part in (
-            _warp(shown, surfaces, rays, flat, users, np.inf),
-            _warp(shown, hidden, rays, on_ground, None, FREE_SHARE),
+            _warp(recorded, surfaces, rays, flat, users, np.inf),
+            _warp(recorded, hidden, rays, on_ground, None, FREE_SHARE),
         )
     )
     chosen = on_ground.view_as(depth) > 0
     if len(lenses) > 1:
         step = ground.step_px(size)
         across = size // step | 1
-        both = torch.cat([part[:, :2, ::step, ::step] for part in (by_ground, by_depth)])
-        of_ground, of_depth = _disagreement(both, across).chunk(2)
+        coarse = torch.cat([part[:, :2, ::step, ::step] for part in (by_ground, by_depth)])
+        of_ground, of_depth = _disagreement(coarse, across).chunk(2)
         share = (depth / on_ground.view_as(depth).clamp(min=ground.NEAREST_M))[:, ::step, ::step]
         about = (share > ground.ABOUT[0]) & (share < ground.ABOUT[1])
         most = torch.where(about, ground.NEAR_PREFERENCE, ground.PREFERENCE) * across**2
@@ -206,10 +206,10 @@ def _boxes(views: Sequence[CarriedView]) -> tuple[F64, F64, F64, F64]:
     walls = np.ones((*shape, 2, 3))  # of equal ones nothing lies between
     then = np.zeros((*shape, 3 * len(views[0].pinholes), 4))
     for v, view in enumerate(views):
-        names, seen = view.target.placed
+        names, boxes = view.target.placed
         count = len(names)
         project = np.array([image.project for image in view.pinholes])
-        ray[v, :count], eye[v, :count], walls[v, :count] = seen.ray, seen.eye, seen.walls
+        ray[v, :count], eye[v, :count], walls[v, :count] = boxes.ray, boxes.eye, boxes.walls
         for i, name in enumerate(names):
             T_world_box = [image.recorded.actors.get(name, ABSENT) for image in view.pinholes]
             then[v, i] = (project @ np.array(T_world_box)).reshape(-1, 4)
@@ -240,32 +240,32 @@ def _warp(
         free_share: A recorded surface at least this share of a point's distance away does not hide it.
     """
     points = rays * torch.where(depth > 0, depth, INFINITY_M)[:, None]
-    there = _turned(recorded.from_view, points)
+    in_recorded = _turned(recorded.from_view, points)
     for i in reversed(range(0 if users is None else users.ray.shape[1])):  # of two the first counts
         assert users is not None
         local = users.ray[:, i] @ points + users.eye[:, i]
         inside = (local >= users.walls[:, i, 0]) & (local < users.walls[:, i, 1])
         inside = inside.all(dim=1, keepdim=True) & (depth > 0)[:, None]
-        there = torch.where(inside, _turned(users.then[:, i], local), there)
-    u, v, w = there.reshape(-1, 3, there.shape[2]).unbind(1)
+        in_recorded = torch.where(inside, _turned(users.then[:, i], local), in_recorded)
+    u, v, w = in_recorded.reshape(-1, 3, in_recorded.shape[2]).unbind(1)
     u = u / w
     v = v / w
     height, width = recorded.sizes_px[..., None].unbind(1)
-    shown = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u = torch.where(shown, u, 0.5)
-    v = torch.where(shown, v, 0.5)
+    inside_image = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    u = torch.where(inside_image, u, 0.5)
+    v = torch.where(inside_image, v, 0.5)
     place = v.long() * surfaces.shape[2] + u.long()
     surface = surfaces.flatten(1).gather(1, place).double()
     surface = torch.where(surface > 0, surface, INFINITY_M)
     far = (surface > INFINITY_M / 2) & (w > INFINITY_M / 2)
     agrees = far | (surface >= free_share * w) | ((surface - w).abs() < SLACK * w + SLACK_M)
-    held = torch.where(agrees, VALID, INCONSISTENT) * shown
+    held = torch.where(agrees, VALID, INCONSISTENT) * inside_image
     rows, columns = recorded.rgb.shape[2:]
     grid = torch.stack([(2 * u - 1) / (columns - 1) - 1, (2 * v - 1) / (rows - 1) - 1], dim=-1)
-    found = F.grid_sample(
+    sampled = F.grid_sample(
         recorded.rgb, grid[:, None].float(), "bicubic", padding_mode="border", align_corners=True
     )
-    levels = (found[:, :, 0].mT + 0.5).clamp(0, 255)
+    levels = (sampled[:, :, 0].mT + 0.5).clamp(0, 255)
     out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
     return out.view(len(depth), -1, *out.shape[1:])
 

@@ -49,16 +49,16 @@ def joined_tensor(
     first = images[0]
     shape = sides[0].height, sides[0].width
     total = torch.zeros((*shape, first.shape[-1]), device=first.device)
-    shown = torch.zeros((*shape, 1), device=first.device)
+    weight_sum = torch.zeros((*shape, 1), device=first.device)
     for side, image in zip(sides, images, strict=True):
         place, weight = _uploaded(side, first.device)
         channels = image.permute(2, 0, 1)[None].float()
-        seen = F.grid_sample(channels, place, padding_mode="border", align_corners=False)
-        seen = seen[0].permute(1, 2, 0)
-        share = weight * (seen[..., -1:] + float(NOT_HELD)) if holds else weight
-        total[side.part] += share * seen
-        shown[side.part] += share
-    mean = torch.where(shown > 0, total / shown.clamp(min=LEAST), outside)
+        sampled = F.grid_sample(channels, place, padding_mode="border", align_corners=False)
+        sampled = sampled[0].permute(1, 2, 0)
+        share = weight * (sampled[..., -1:] + float(NOT_HELD)) if holds else weight
+        total[side.part] += share * sampled
+        weight_sum[side.part] += share
+    mean = torch.where(weight_sum > 0, total / weight_sum.clamp(min=LEAST), outside)
     return mean if first.is_floating_point() else mean.round().to(first.dtype)
 
 

@@ -68,7 +68,7 @@ def _gather_references(references, render, mean4, mean2, each4, each2):
             i2 = y // DETAIL
             at4 = (y % CELL) * CELL * CHANNELS
             at2 = (y % DETAIL) * DETAIL * CHANNELS
-            own = render[b, y]
+            render_row = render[b, y]
             mean[:] = np.float32(0.0)
             for k in range(count):
                 line = references[b, k, y]
@@ -78,7 +78,7 @@ def _gather_references(references, render, mean4, mean2, each4, each2):
                     holds = row[CHANNELS * x + 3] * level * np.float32(0.5)
                     for c in range(3):
                         row[CHANNELS * x + c] = (
-                            row[CHANNELS * x + c] * level - np.float32(1.0) - own[x, c]
+                            row[CHANNELS * x + c] * level - np.float32(1.0) - render_row[x, c]
                         ) * holds
                     row[CHANNELS * x + 3] = holds
                 for i in range(len(row)):
@@ -90,16 +90,16 @@ def _gather_references(references, render, mean4, mean2, each4, each2):
 
 
 @inlined_kernel
-def _put_runs(row, cells, at, run):
+def _put_runs(row, cells, offset, run):
     """Write a row of pixels into the row of cells that it crosses, ``run`` values into each, from
-    ``at`` on.
+    ``offset`` on.
 
     It is inlined, so that ``run`` is a constant where it is called, and a run is a vector.
     """
     for j in range(cells.shape[0]):
         cell = cells[j]
         for i in range(run):
-            cell[at + i] = row[run * j + i]
+            cell[offset + i] = row[run * j + i]
 
 
 def blend(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tensor, Tensor]:
@@ -137,8 +137,8 @@ def enlarge(
         if heads.finer is not None:
             finer = _array(heads.finer.permute(0, 2, 3, 1))
 
-    def enlarge_band(at: tuple[int, int]) -> None:
-        b, first = at
+    def enlarge_band(image_and_row: tuple[int, int]) -> None:
+        b, first = image_and_row
         band = slice(first, min(first + BAND * scale, height))
         added = _enlarged_rows(changes[b], scale, band)[:, :width]
         image = cv2.addWeighted(renders[b, band], 1 / HALF, added, 1, -1, dtype=cv2.CV_32F)
@@ -165,8 +165,8 @@ def _enlarged_rows(coarse: np.ndarray, side: int, rows: slice) -> np.ndarray:
     above = max(rows.start // side - 1, 0)
     around = coarse[above : -(-rows.stop // side) + 1]
     out = cv2.resize(around, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)
-    own = out[rows.start - above * side :][: rows.stop - rows.start]
-    return own.reshape(*own.shape[:2], -1)
+    inner = out[rows.start - above * side :][: rows.stop - rows.start]
+    return inner.reshape(*inner.shape[:2], -1)
 
 
 @vector_kernel

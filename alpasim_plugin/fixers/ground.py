@@ -75,12 +75,12 @@ def carry(
     view = replace(target, depth=depth, ground=ground, actors={})
     view = view.window(slice(top, None, step), columns)
     by_ground = _warp_all(compared, view, threads)
-    own = [image[top // step :] for image in by_depth]
+    coarse = [image[top // step :] for image in by_depth]
     share = target.depth[top::step, ::step] / np.maximum(view.depth, NEAREST_M)
     about = (share > ABOUT[0]) & (share < ABOUT[1])
     agrees = (
         _disagreement(by_ground[0], by_ground[1], across)
-        <= _disagreement(own[0], own[1], across)
+        <= _disagreement(coarse[0], coarse[1], across)
         + np.where(about, NEAR_PREFERENCE, PREFERENCE) * across**2
     )
     height, width = ground[top:].shape

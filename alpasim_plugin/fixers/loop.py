@@ -87,17 +87,19 @@ class BlockRunner:
         parts = self._pinholes([part for cut in cuts for part in cut])
         if not self.cover.sides:
             return parts
-        rest = iter(parts)
-        shown = [
-            (request, [next(rest) for _ in cut])
+        remaining = iter(parts)
+        request_parts = [
+            (request, [next(remaining) for _ in cut])
             for request, cut in zip(requests, cuts, strict=True)
         ]
         threads = 1 if parts[0].frame.pending else thread_count(self.threads)
         with self._timed("lens"):
-            return map_on_threads(threads, self._joined, shown)
+            return map_on_threads(threads, self._joined, request_parts)
 
-    def _joined(self, shown: tuple[RenderRequest, Sequence[ConditionedFrame]]) -> ConditionedFrame:
-        request, parts = shown
+    def _joined(
+        self, request_parts: tuple[RenderRequest, Sequence[ConditionedFrame]]
+    ) -> ConditionedFrame:
+        request, parts = request_parts
         if request.camera.lens is None:
             return parts[0]
         sides = self.cover.sides[request.camera.name]
@@ -161,10 +163,10 @@ class BlockRunner:
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
 
 
-def _problem(given: Sequence[Frame], fixed: Sequence[Frame]) -> str:
-    if len(fixed) != len(given):
+def _problem(rendered: Sequence[Frame], fixed: Sequence[Frame]) -> str:
+    if len(fixed) != len(rendered):
         return f"{len(fixed)} frames came back"
-    for before, after in zip(given, fixed, strict=True):
+    for before, after in zip(rendered, fixed, strict=True):
         if (before.t_us, before.camera) != (after.t_us, after.camera):
             return f"camera {before.camera!r} at {before.t_us} us came back as {after.camera!r} at {after.t_us} us"
         if after.rgb.shape != (*before.size, 3) or after.rgb.dtype != np.uint8:
@@ -271,8 +273,8 @@ def fixed_renderer(
     references = session_of(settings, scenario, recorded, threads)
     first = complete(make_fixer(), Fixer)
     on_device = first.reads_device
-    drawn = render, scene_map, scenario.actors
-    runner = BlockRunner(*drawn, threads, references, on_device, cover)
+    sources = render, scene_map, scenario.actors
+    runner = BlockRunner(*sources, threads, references, on_device, cover)
     if first.blocks == ONE_BY_ONE:
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)

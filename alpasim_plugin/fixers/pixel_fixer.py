@@ -9,7 +9,7 @@ cameras are a batch. On a GPU it waits for nothing, and is recorded as a graph.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 from alpasim_plugin.core.devices import CapturedFunction, Sizes, download, sizes_of, upload
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer
-from alpasim_plugin.core.types import OPACITY_MEAN, U8, Frame
+from alpasim_plugin.core.types import OPACITY_MEAN, U8, DevicePlanes, Frame
 from alpasim_plugin.fixers import guard
 from alpasim_plugin.fixers.guard import render_share
 from alpasim_plugin.fixers.network.pixel_generator import (
@@ -73,25 +73,74 @@ class FixedFrame(NamedTuple):
     recorded: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class DownloadedFrame:
+    """What the host knows of one fixed frame of B cameras, fetched in one transfer.
+
+    Attributes:
+        images: ``(B, H, W, 3)`` uint8.
+        measured: ``(B, 6)``, see `guard.measures`.
+        sums: See `trust_sums`.
+        pairs: Splats and tiles that each camera's render needed; empty where the host drew it.
+        opacity: Mean opacity of each camera's render; empty where the host drew it.
+    """
+
+    images: Any
+    measured: Any
+    sums: Any
+    pairs: Sequence[Any]
+    opacity: Sequence[Any]
+
+    def has_overflow(self, planes: Sequence[DevicePlanes]) -> bool:
+        """Tell whether a device's buffer of splats was too small for a camera's render."""
+        fits = [plane.had_room(int(count)) for plane, count in zip(planes, self.pairs, strict=True)]
+        return not all(fits)
+
+
+def device_planes(view: Views, block: Sequence[Frame]) -> list[DevicePlanes]:
+    """Return the planes of a view's frames that a device drew; empty where the host did."""
+    if isinstance(view.rgb, np.ndarray):
+        return []
+    return planes_of([block[index] for (index,) in view.index])
+
+
+def download_frame(outputs: FixedFrame, planes: Sequence[DevicePlanes]) -> DownloadedFrame:
+    """Fetch what the host needs of a fixed frame."""
+    images, measured, sums, *counts_and_opacity = download(
+        outputs.levels,
+        outputs.measured,
+        outputs.sums,
+        *(plane.pairs for plane in planes),
+        *(plane.alpha.mean() for plane in planes),
+    )
+    return DownloadedFrame(
+        images=images,
+        measured=measured,
+        sums=sums,
+        pairs=counts_and_opacity[: len(planes)],
+        opacity=counts_and_opacity[len(planes) :],
+    )
+
+
 @torch.inference_mode()
 def fix_frame(
-    generator: LoadedGenerator, settings: PixelFixerSettings, given: GivenFrame
+    generator: LoadedGenerator, settings: PixelFixerSettings, inputs: GivenFrame
 ) -> FixedFrame:
     """Fix one frame; a large one as a smaller one, whose changes are then enlarged."""
     net = generator.net
     operations = generator.operations
-    scale = settings.scale_of(*given.rgb.shape[1:3])
-    rgb = operations.smaller(given.rgb, scale)
+    scale = settings.scale_of(*inputs.rgb.shape[1:3])
+    rgb = operations.smaller(inputs.rgb, scale)
     alpha, maps, references = (
         None if part is None else operations.smaller(part, scale)
         for part in (
-            None if given.alpha is None else given.alpha[..., None],
-            given.maps,
-            given.references,
+            None if inputs.alpha is None else inputs.alpha[..., None],
+            inputs.maps,
+            inputs.references,
         )
     )
     _, height, width, _ = rgb.shape
-    state = PixelState(given.output, given.render, given.hidden, given.recorded)
+    state = PixelState(inputs.output, inputs.render, inputs.hidden, inputs.recorded)
     render = in_range(rgb)
     opacity = torch.ones_like(render[..., :1]) if alpha is None else padded(alpha)
     sdmap = torch.full_like(render, -1.0) if maps is None else in_range(maps)
@@ -102,9 +151,9 @@ def fix_frame(
     transparent = torch.zeros_like(opacity) if settings.holes == "everywhere" else opacity
 
     def source(draw: int) -> Tensor:
-        if given.keys is None:
+        if inputs.keys is None:
             return render
-        return operations.source(render, transparent, given.keys[draw])
+        return operations.source(render, transparent, inputs.keys[draw])
 
     def predict(z: Tensor, t: Tensor | None) -> tuple[Repaired, Tensor, PixelState]:
         repaired = net.repair(render, opacity, sdmap, state, z, t, references, operations)
@@ -129,12 +178,12 @@ def fix_frame(
     measured = guard.measures(video[visible], levels, rgb, *before)
     sums = trust_sums(output, after.render[visible], after.recorded[visible])
     if scale > 1:
-        heads, recorded = repaired.heads, given.references
+        heads, recorded = repaired.heads, inputs.references
         finer = net.finer if scale >= FINER_FROM else None
         if heads is not None and recorded is not None and finer is not None:
-            parts = (operations.smaller(part, FINER_PX) for part in (given.rgb, recorded))
+            parts = (operations.smaller(part, FINER_PX) for part in (inputs.rgb, recorded))
             heads = heads._replace(finer=finer(*parts, change, heads.weight, scale))
-        levels = operations.enlarge(given.rgb, change, recorded, heads, scale)
+        levels = operations.enlarge(inputs.rgb, change, recorded, heads, scale)
     return FixedFrame(levels, measured, sums, *after)
 
 
@@ -144,7 +193,7 @@ def _captured(
 ) -> CapturedFunction:
     """Return `fix_frame` as a graph for tensors of some sizes."""
     return CapturedFunction(
-        lambda **given: fix_frame(generator, settings, GivenFrame(**given)),
+        lambda **inputs: fix_frame(generator, settings, GivenFrame(**inputs)),
         sizes,
         generator.device,
     )
@@ -197,8 +246,8 @@ class PixelFixer(Fixer):
         self.scene_id = scene_id
         self.generator = load_generator(settings, device)
         self.trained = self.generator.trained
-        at = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
-        self.label = f"{settings.name}{at}, {self.generator.note}, {settings.precision}"
+        step_suffix = f"@{len(settings.steps)}" if len(settings.steps) > 1 else ""
+        self.label = f"{settings.name}{step_suffix}, {self.generator.note}, {settings.precision}"
         self.reset(seed)
 
     def reset(self, seed: int) -> None:
@@ -251,8 +300,8 @@ class PixelFixer(Fixer):
     def _advance(
         self, block: Sequence[Frame], maps: Sequence[U8], pasts: Mapping[str, CameraHistory]
     ) -> tuple[tuple[Frame, ...], dict[str, CameraHistory]]:
-        drawn = maps if self.settings.uses_map else ()
-        views = group_views(block, drawn, 1, on_device=True)
+        used_maps = maps if self.settings.uses_map else ()
+        views = group_views(block, used_maps, 1, on_device=True)
         for view in views:
             check_continues(view, pasts)
         out = list(block)
@@ -270,64 +319,102 @@ class PixelFixer(Fixer):
         self, view: Views, block: Sequence[Frame], histories: Mapping[str, CameraHistory]
     ) -> list[tuple[Frame, CameraHistory]]:
         """Fix the frame of each camera of a view; return it and the camera's past for the next."""
-        device = self.generator.device
-        frames = [block[index] for (index,) in view.index]
-        drawn = [] if isinstance(view.rgb, np.ndarray) else planes_of(frames)
-        rgb, alpha, maps, references = (
-            None if part is None else upload(torch.as_tensor(part[:, 0]), device)
-            for part in (view.rgb, view.alpha, view.maps, view.references)
-        )
-        assert rgb is not None
         pasts = [histories.get(camera) for camera in view.cameras]
-        states = [
-            self._start(rgb[b : b + 1]) if past is None else past.state
-            for b, past in enumerate(pasts)
-        ]
-        counts = [0 if past is None else past.frames for past in pasts]
-        scale = self.settings.scale_of(*view.shape)
-        height, width = (-(-side // scale) for side in view.shape)
-        given = GivenFrame(  # type: ignore[call-arg]
-            rgb,
-            *(torch.cat(parts) for parts in zip(*states, strict=True)),
-            alpha,
-            maps,
-            references,
-            self._noise_keys(view, rgb, counts),
-        )
-        fixed_frame = self._run(given)
-        after = PixelState(*fixed_frame[3:])
-        images, measured, sums, *rest = download(
-            fixed_frame.levels,
-            fixed_frame.measured,
-            fixed_frame.sums,
-            *(planes.pairs for planes in drawn),
-            *(planes.alpha.mean() for planes in drawn),
-        )
-        pairs = rest[: len(drawn)]
-        opacity = rest[len(drawn) :]
-        if not all([planes.had_room(int(n)) for planes, n in zip(drawn, pairs, strict=True)]):
-            return self._fix(*_drawn_again(view, block), histories)
+        inputs = self._inputs(view, pasts)
+        outputs = self._run(inputs)
+        planes = device_planes(view, block)
+        downloaded = download_frame(outputs, planes)
+        if downloaded.has_overflow(planes):
+            # the splats did not fit the device's buffer: the render itself is incomplete
+            return self._fix(*rerendered(view, block), histories)
         fixed = []
-        for b, (frame, event) in enumerate(zip(frames, guard.failures(measured), strict=True)):
-            state = PixelState(*(part[b : b + 1] for part in after))
-            if event == guard.NAN:  # it would stay in the state for ever
-                state = self._start(rgb[b : b + 1])
-            history = CameraHistory(state, counts[b] + 1, view.t_us[b][0], rgb[b])
-            events = frame.events
-            facts = dict(frame.facts)
-            if frame.pending is not None:  # nobody has looked at the render yet
-                events += guard.render_events(measured[b])
-            if opacity:
-                facts[OPACITY_MEAN] = round(float(opacity[b]), 5)
-            if event:  # the render is returned, and nothing of the network's
-                frame = frame.changed(references=(), events=(*events, event), facts=facts)
-            else:
-                facts |= trust_facts(sums[b], height, width)
-                made = images[b], fixed_frame.levels[b]
-                kept = {"references": (), "events": events, "facts": facts}
-                frame = frame.changed(**kept, rgb=made[0], fixed=made)
+        for row, ((index,), past) in enumerate(zip(view.index, pasts, strict=True)):
+            frame, state = self._fixed_frame(row, block[index], view.shape, downloaded, outputs)
+            if state is None:
+                state = self._start(inputs.rgb[row : row + 1])
+            count = 1 if past is None else past.frames + 1
+            history = CameraHistory(state, count, view.t_us[row][0], inputs.rgb[row])
             fixed.append((frame, history))
         return fixed
+
+    def _inputs(self, view: Views, pasts: Sequence[CameraHistory | None]) -> GivenFrame:
+        """Upload one frame of B cameras, and put the cameras' pasts side by side.
+
+        Args:
+            view: One frame of each camera, ``T = 1``.
+            pasts: The past of each camera, None before its first frame.
+        """
+        rgb, alpha, maps, references = (
+            None if part is None else upload(torch.as_tensor(part[:, 0]), self.generator.device)
+            for part in (view.rgb, view.alpha, view.maps, view.references)
+        )
+        assert rgb is not None, "a view has images"
+        states = [
+            self._start(rgb[row : row + 1]) if past is None else past.state
+            for row, past in enumerate(pasts)
+        ]
+        counts = [0 if past is None else past.frames for past in pasts]
+        return GivenFrame(
+            rgb=rgb,
+            output=torch.cat([state.output for state in states]),
+            render=torch.cat([state.render for state in states]),
+            hidden=torch.cat([state.hidden for state in states]),
+            recorded=torch.cat([state.recorded for state in states]),
+            alpha=alpha,
+            maps=maps,
+            references=references,
+            keys=self._noise_keys(view, rgb, counts),
+        )
+
+    def _fixed_frame(
+        self,
+        row: int,
+        frame: Frame,
+        shape: tuple[int, int],
+        downloaded: DownloadedFrame,
+        outputs: FixedFrame,
+    ) -> tuple[Frame, PixelState | None]:
+        """Make the frame of one camera, guarded.
+
+        Args:
+            row: The camera's row in ``downloaded`` and ``outputs``.
+            frame: Its render.
+            shape: Height and width of the image.
+            downloaded: What the host knows of the network's output.
+            outputs: The network's output on its device.
+
+        Returns:
+            The frame, which is the render with an event where the output fails the guard; and the
+            camera's state, None where the output is not finite: it would stay in the state for ever.
+        """
+        event = guard.failures(downloaded.measured[row : row + 1])[0]
+        events = frame.events
+        facts = dict(frame.facts)
+        if frame.pending is not None:  # nobody has looked at the render yet
+            events += guard.render_events(downloaded.measured[row])
+        if downloaded.opacity:
+            facts[OPACITY_MEAN] = round(float(downloaded.opacity[row]), 5)
+        state = PixelState(
+            output=outputs.output[row : row + 1],
+            render=outputs.render[row : row + 1],
+            hidden=outputs.hidden[row : row + 1],
+            recorded=outputs.recorded[row : row + 1],
+        )
+        if event:
+            refused = frame.changed(references=(), events=(*events, event), facts=facts)
+            return refused, None if event == guard.NAN else state
+        scale = self.settings.scale_of(*shape)
+        height, width = (-(-side // scale) for side in shape)
+        facts |= trust_facts(downloaded.sums[row], height, width)
+        image = downloaded.images[row]
+        repaired = frame.changed(
+            references=(),
+            events=events,
+            facts=facts,
+            rgb=image,
+            fixed=(image, outputs.levels[row]),
+        )
+        return repaired, state
 
     def _start(self, rgb: Tensor) -> PixelState:
         """Return the state before a first frame ``(1, H, W, 3)``."""
@@ -352,22 +439,22 @@ class PixelFixer(Fixer):
         ]
         return upload(keys, rgb.device)
 
-    def _run(self, given: GivenFrame) -> FixedFrame:
+    def _run(self, inputs: GivenFrame) -> FixedFrame:
         """Run `fix_frame`, on a GPU as a graph that was recorded for tensors of these sizes."""
         if not self.generator.captured:
-            return fix_frame(self.generator, self.settings, given)
-        tensors = {name: part for name, part in given._asdict().items() if part is not None}
+            return fix_frame(self.generator, self.settings, inputs)
+        tensors = {name: part for name, part in inputs._asdict().items() if part is not None}
         return FixedFrame(*_captured(self.generator, self.settings, sizes_of(tensors))(tensors))
 
 
-def _drawn_again(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[Frame]]:
-    """Return a view that lacks splats, and its block, drawn again by the device."""
+def rerendered(view: Views, block: Sequence[Frame]) -> tuple[Views, Sequence[Frame]]:
+    """Re-render the frames whose splat buffer overflowed, with buffers that have room."""
     frames = list(block)
-    mine = [index for (index,) in view.index]
-    again = [planes.again() for planes in planes_of([frames[index] for index in mine])]
-    for index, planes in zip(mine, again, strict=True):
+    indices = [index for (index,) in view.index]
+    complete = [planes.again() for planes in planes_of([frames[index] for index in indices])]
+    for index, planes in zip(indices, complete, strict=True):
         frames[index] = frames[index].changed(on_device=planes)
-    rgb, alpha, references = stacked(again)
+    rgb, alpha, references = stacked(complete)
     if references is not None:
         view = replace(view, references=references[:, None])
     return replace(view, rgb=rgb[:, None], alpha=alpha[:, None]), frames

@@ -80,8 +80,8 @@ class ReferenceIndex:
         """
         frame = self.recorded[i]
         ahead = self._axes @ self._axes[i]
-        own = self._lenses[frame.t_us, lens_camera(frame.camera)]
-        return [i, *sorted((j for j in own if j != i), key=lambda j: -ahead[j])]
+        lens_frames = self._lenses[frame.t_us, lens_camera(frame.camera)]
+        return [i, *sorted((j for j in lens_frames if j != i), key=lambda j: -ahead[j])]
 
     def choose(
         self,
@@ -230,8 +230,8 @@ class ReferenceSession:
             K[1, 2] -= top
             near = depth[top : band.rows.stop + around]
             target = WarpTarget(K, band.T_world_camera, near, band.actors, self._boxes)
-            own = slice(band.rows.start - top, band.rows.stop - top), band.columns
-            windows.append(Window(band, target, own))
+            inner = slice(band.rows.start - top, band.rows.stop - top), band.columns
+            windows.append(Window(band, target, inner))
         return windows
 
     def _carried(
@@ -269,8 +269,8 @@ class ReferenceSession:
         )
         if self.hysteresis:
             self._last[camera] = chosen
-        at = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
-        return chosen, se3(self._ego_log.xyz[at], self._ego_log.quat[at])
+        nearest = int(np.linalg.norm(self._ego_log.xyz - T_world_camera[:3, 3], axis=1).argmin())
+        return chosen, se3(self._ego_log.xyz[nearest], self._ego_log.quat[nearest])
 
     def _read(self, i: int) -> RecordedImage:
         frame = self.index.recorded[i]
@@ -308,11 +308,11 @@ def _whole(
     request: RenderRequest, windows: Sequence[Window], parts: Sequence[Sequence[Any]]
 ) -> tuple[Any, ...]:
     """Return each recorded frame in a view, of those in its windows."""
-    own = [
+    views = [
         [image[window.own] for image in part] for window, part in zip(windows, parts, strict=True)
     ]
     exposed = [window.band for window in windows]
-    return tuple(joined(request, exposed, images) for images in zip(*own, strict=True))
+    return tuple(joined(request, exposed, images) for images in zip(*views, strict=True))
 
 
 def session_of(
@@ -327,5 +327,5 @@ def session_of(
     """
     if not (settings.references and recorded):
         return None
-    of = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
-    return ReferenceSession(*of, hysteresis, thread_count(threads))
+    arguments = recorded, scenario.actors, scenario.ego_log, settings.references, settings.recording
+    return ReferenceSession(*arguments, hysteresis, thread_count(threads))

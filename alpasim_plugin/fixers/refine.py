@@ -83,9 +83,9 @@ def refine_frames(
         index += 1
 
 
-def _psnr_db(given: Frame, fixed: Frame) -> float:
+def _psnr_db(rendered: Frame, fixed: Frame) -> float:
     difference = Difference()
-    difference.add(given.rgb, fixed.rgb)
+    difference.add(rendered.rgb, fixed.rgb)
     return difference.psnr_db
 
 

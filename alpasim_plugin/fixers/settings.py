@@ -161,9 +161,9 @@ class BundleKind:
 
     def problems(self, parts: Iterable[str]) -> list[str]:
         """Return what is missing and what does not belong."""
-        found = set(parts)
-        unknown = sorted(found - self.needed - self.optional)
-        return [f"no {part}.*" for part in sorted(self.needed - found)] + [
+        present = set(parts)
+        unknown = sorted(present - self.needed - self.optional)
+        return [f"no {part}.*" for part in sorted(self.needed - present)] + [
             f"unknown part {part}.*" for part in unknown
         ]
 

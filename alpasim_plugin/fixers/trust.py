@@ -34,9 +34,11 @@ def trust_sums(output: Tensor, render: Tensor, recorded: Tensor) -> Tensor:
     height, width = recorded.shape[1:3]
     side = cell_px(width)
     red, green, blue = (output - render).abs_().unbind(-1)
-    known = recorded[..., 0]
-    guessed = ((red + green + blue) / (3 * MADE_UP)).clamp_(max=1).mul_(1 - known)
-    whole = F.pad(torch.stack([known, guessed], dim=1), (0, -width % side, 0, -height % side))
+    recorded_share = recorded[..., 0]
+    guessed = ((red + green + blue) / (3 * MADE_UP)).clamp_(max=1).mul_(1 - recorded_share)
+    whole = F.pad(
+        torch.stack([recorded_share, guessed], dim=1), (0, -width % side, 0, -height % side)
+    )
     return F.avg_pool2d(whole, side).permute(0, 2, 3, 1) * side**2
 
 

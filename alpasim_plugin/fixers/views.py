@@ -98,21 +98,21 @@ def group_views(
     index: dict[str, list[int]] = {}
     for i in sorted(range(len(block)), key=lambda i: (block[i].camera, block[i].t_us)):
         index.setdefault(block[i].camera, []).append(i)
-    counts = {camera: len(mine) for camera, mine in index.items()}
+    counts = {camera: len(indices) for camera, indices in index.items()}
     if len(set(counts.values())) > 1 or max(counts.values()) > frames_due:
         raise InputError(
             f"frames by camera: {counts}",
             f"give each camera the same number of frames, at most {frames_due}",
         )
     sizes: dict[tuple[int, ...], list[str]] = {}
-    for camera, mine in index.items():
-        times = [block[i].t_us for i in mine]
+    for camera, indices in index.items():
+        times = [block[i].t_us for i in indices]
         if len(set(times)) < len(times):
             raise InputError(
                 f"camera {camera!r}: two frames at one time: {times}", "give every frame once"
             )
-        shape = (*block[mine[0]].size, 3)
-        for i in mine:
+        shape = (*block[indices[0]].size, 3)
+        for i in indices:
             _check_frame(block[i], maps[i] if maps else None, shape)
         sizes.setdefault(shape, []).append(camera)
     return tuple(_stack(block, maps, sizes[shape], index, on_device) for shape in sorted(sizes))
@@ -138,25 +138,25 @@ def check_continues(view: Views, pasts: Mapping[str, Past]) -> None:
 
 def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None:
     """Refuse a frame, its map and its references unless they have the size ``shape``."""
-    what = f"camera {frame.camera!r} at {frame.t_us} us"
+    subject = f"camera {frame.camera!r} at {frame.t_us} us"
     if frame.pending is None:
         rgb = frame.rgb
         if rgb.ndim != 3 or rgb.shape[2] != 3 or 0 in rgb.shape or rgb.dtype != np.uint8:
             raise InputError(
-                f"{what}: rgb is {rgb.dtype} {rgb.shape}", "give (height, width, 3) uint8"
+                f"{subject}: rgb is {rgb.dtype} {rgb.shape}", "give (height, width, 3) uint8"
             )
     if frame.size != shape[:2]:
         raise InputError(
-            f"{what}: rgb of {frame.size} after {shape[:2]} (height, width)",
+            f"{subject}: rgb of {frame.size} after {shape[:2]} (height, width)",
             "keep a camera's image size for the whole rollout",
         )
-    given = [("a reference", image, (*shape[:2], 4)) for image in frame.references]
+    named_images = [("a reference", image, (*shape[:2], 4)) for image in frame.references]
     if sdmap is not None:
-        given.append(("the map", sdmap, shape))
-    for name, image, due in given:
+        named_images.append(("the map", sdmap, shape))
+    for name, image, due in named_images:
         if image.shape != due or str(image.dtype).rpartition(".")[2] != "uint8":
             raise InputError(
-                f"{what}: {name} is {image.dtype} {image.shape}",
+                f"{subject}: {name} is {image.dtype} {image.shape}",
                 f"give uint8 {due}, the size of the frame",
             )
     if frame.pending is not None or frame.alpha is None:
@@ -164,14 +164,14 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
     alpha = frame.alpha
     if alpha.shape != shape[:2]:
         raise InputError(
-            f"{what}: alpha of {alpha.shape} with rgb of {shape[:2]} (height, width)",
+            f"{subject}: alpha of {alpha.shape} with rgb of {shape[:2]} (height, width)",
             "give both at one size",
         )
     low = float(alpha.min())
     high = float(alpha.max())
     if not (low >= -SLACK and high <= 1 + SLACK):  # also refuses NaN, which min and max propagate
         raise RendererError(
-            f"{what}: opacity from {low:.4g} to {high:.4g}",
+            f"{subject}: opacity from {low:.4g} to {high:.4g}",
             "repair the renderer: its opacity is accumulated alpha, 0 to 1",
         )
 
@@ -189,10 +189,10 @@ def _stack(
     frames = [block[i] for i in flat]
     shape = (*frames[0].size, 3)
     lead = (len(names), len(order[0]))
-    drawn = planes_of(frames) if on_device else []
+    device_planes = planes_of(frames) if on_device else []
     references: Any = None
-    if len(drawn) == len(frames):
-        rgb, alpha, references = stacked(drawn)
+    if len(device_planes) == len(frames):
+        rgb, alpha, references = stacked(device_planes)
     else:
         rgb = np.stack([frame.rgb for frame in frames])
         alpha = _opacity(frames)
@@ -201,11 +201,11 @@ def _stack(
         import torch
 
         joined = torch.stack
-    given = [] if references is not None else [_references(frame) for frame in frames]
-    count = max(map(len, given), default=0)
+    frame_references = [] if references is not None else [_references(frame) for frame in frames]
+    count = max(map(len, frame_references), default=0)
     if count:
         references = np.zeros((len(frames), count, *shape[:2], 4), np.uint8)
-        for i, images in enumerate(given):
+        for i, images in enumerate(frame_references):
             for k, image in enumerate(images):
                 references[i, k] = image
     if references is not None:
@@ -233,21 +233,21 @@ def planes_of(frames: Sequence[Frame]) -> list[DevicePlanes]:
     return [frame.pending for frame in frames if frame.pending is not None]
 
 
-def stacked(drawn: Sequence[DevicePlanes]) -> tuple[Any, Any, Any]:
+def stacked(frames: Sequence[DevicePlanes]) -> tuple[Any, Any, Any]:
     """Return images, opacities and references ``(N, K, H, W, 4)`` that a device drew as one tensor
     each; None where no view has a reference.
     """
     import torch
 
-    rgb = torch.stack([planes.rgb for planes in drawn])
-    alpha = torch.stack([planes.alpha for planes in drawn])
-    counts = [0 if planes.references is None else len(planes.references) for planes in drawn]
+    rgb = torch.stack([planes.rgb for planes in frames])
+    alpha = torch.stack([planes.alpha for planes in frames])
+    counts = [0 if planes.references is None else len(planes.references) for planes in frames]
     if not any(counts):
         return rgb, alpha, None
-    references = rgb.new_zeros((len(drawn), max(counts), *rgb.shape[1:3], 4))
-    for mine, count, planes in zip(references, counts, drawn, strict=True):
+    references = rgb.new_zeros((len(frames), max(counts), *rgb.shape[1:3], 4))
+    for row, count, planes in zip(references, counts, frames, strict=True):
         if count:
-            mine[:count] = planes.references
+            row[:count] = planes.references
     return rgb, alpha, references
 
 

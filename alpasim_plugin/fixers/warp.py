@@ -129,14 +129,14 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     ground = np.zeros(shape, bool) if target.ground is None else target.ground
     users = np.zeros(depth_then.shape, bool) if recorded.users is None else recorded.users
     _coordinates(depth, ground, depth_then, users, A, b, x, y, held)
-    names, seen = target.placed
+    names, boxes = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([recorded.actors.get(name, absent) for name in names])
     to_then: F64 = project @ T_then_box.reshape(-1, 4, 4)
-    shown = np.flatnonzero((seen.pixels[:, ::2] < seen.pixels[:, 1::2]).all(axis=1))
-    for i in reversed(shown):  # of two boxes the first counts
-        part = slice(*seen.pixels[i, :2]), slice(*seen.pixels[i, 2:])
-        box = seen.ray[i], seen.eye[i], seen.walls[i], to_then[i], seen.pixels[i]
+    visible = np.flatnonzero((boxes.pixels[:, ::2] < boxes.pixels[:, 1::2]).all(axis=1))
+    for i in reversed(visible):  # of two boxes the first counts
+        part = slice(*boxes.pixels[i, :2]), slice(*boxes.pixels[i, 2:])
+        box = boxes.ray[i], boxes.eye[i], boxes.walls[i], to_then[i], boxes.pixels[i]
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
     # What lies outside is not looked up; the margin gives all that is inside its neighbours.
@@ -146,11 +146,11 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     cv2.remap(then, x, y, cv2.INTER_CUBIC, dst=rgb, borderMode=cv2.BORDER_TRANSPARENT)
     out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
     step = max(1, shape[1] // SEARCHED)
-    some = slice(0, None, step)
+    coarse = slice(0, None, step)
     for other in recorded.others:
         hole = out[..., 3] == 0
-        fills = warp(other, target.window(some, some))[..., 3] > 0
-        places = np.argwhere(hole[some, some] & fills)
+        fills = warp(other, target.window(coarse, coarse))[..., 3] > 0
+        places = np.argwhere(hole[coarse, coarse] & fills)
         if len(places):
             top, left = np.maximum(places.min(axis=0) - 1, 0) * step
             below, right = (places.max(axis=0) + 2) * step
@@ -189,20 +189,20 @@ def place_boxes(
         :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
     ]  # (A, 8, 3)
     project = K @ inverse(T_box_camera)[:, :3]
-    shown = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
-    behind = (shown[..., 2] <= 0).all(axis=1, keepdims=True)
-    around = (shown[..., 2] <= NEAREST_M).any(
+    projected = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
+    behind = (projected[..., 2] <= 0).all(axis=1, keepdims=True)
+    around = (projected[..., 2] <= NEAREST_M).any(
         axis=1, keepdims=True
     )  # some corners lie behind the camera, and the box may reach anywhere
     with np.errstate(divide="ignore", invalid="ignore"):
-        u_v = shown[..., :2] / shown[..., 2:]
+        u_v = projected[..., :2] / projected[..., 2:]
     whole = np.array(shape[::-1])
     first = np.where(around, 0, np.clip(np.floor(u_v.min(axis=1)), 0, whole))
     last = np.where(behind, 0, np.where(around, whole, np.clip(np.ceil(u_v.max(axis=1)), 0, whole)))
     pixels = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=1).astype(np.int64)
     ray = np.ascontiguousarray(T_box_camera[:, :3, :3] @ np.linalg.inv(K))
-    seen = SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
-    return PlacedBoxes(names, seen)
+    seen_boxes = SeenBoxes(ray, np.ascontiguousarray(T_box_camera[:, :3, 3]), walls, pixels)
+    return PlacedBoxes(names, seen_boxes)
 
 
 @float_kernel
@@ -213,7 +213,7 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
     surfaces, of_user = depth_then.reshape(-1), users.reshape(-1)
     place = np.empty(width, np.uint32)
     distance = np.empty(width, np.float64)
-    seen = np.empty(width, np.bool_)
+    is_inside = np.empty(width, np.bool_)
     for row in range(height):
         v0 = row + 0.5
         ax = A[0, 1] * v0 + A[0, 2]
@@ -226,18 +226,18 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
             rz = z * (A[2, 0] * u0 + az) + b[2]
             u = (z * (A[0, 0] * u0 + ax) + b[0]) / rz
             v = (z * (A[1, 0] * u0 + ay) + b[1]) / rz
-            there = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
-            u, v = u if there else 0.5, v if there else 0.5
-            x[row, column] = np.float32(u + FIRST_PX) if there else NOWHERE_PX
+            inside = (rz > NEAREST_M) & (u >= 0) & (u < columns_then) & (v >= 0) & (v < rows_then)
+            u, v = u if inside else 0.5, v if inside else 0.5
+            x[row, column] = np.float32(u + FIRST_PX) if inside else NOWHERE_PX
             y[row, column] = np.float32(v + FIRST_PX)
-            place[column], distance[column], seen[column] = (
+            place[column], distance[column], is_inside[column] = (
                 np.uint32(np.int32(v) * columns_then + np.int32(u)),
                 rz,
-                there,
+                inside,
             )
         for column in range(width):
             then = place[column]
-            if not seen[column]:
+            if not is_inside[column]:
                 held[row, column] = 0
             elif ground[row, column] and of_user[then]:
                 held[row, column] = INCONSISTENT
@@ -251,9 +251,9 @@ def _held(surface, rz, free_share):
     """Return how well it holds that a point at depth ``rz`` of the recorded camera is shown by its
     pixel of depth ``surface``.
     """
-    there = np.float64(surface) if surface > 0 else INFINITY_M
-    far = (there > INFINITY_M / 2) & (rz > INFINITY_M / 2)
-    agrees = far | (there >= free_share * rz) | (abs(there - rz) < SLACK * rz + SLACK_M)
+    recorded_m = np.float64(surface) if surface > 0 else INFINITY_M
+    far = (recorded_m > INFINITY_M / 2) & (rz > INFINITY_M / 2)
+    agrees = far | (recorded_m >= free_share * rz) | (abs(recorded_m - rz) < SLACK * rz + SLACK_M)
     return VALID if agrees else INCONSISTENT
 
 
@@ -289,10 +289,10 @@ def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, x, 
                 held[row, column] = _held(depth_then[int(v), int(u)], rz, np.inf)
 
 
-def on_boxes(shape: tuple[int, int], seen: SeenBoxes) -> Bool:
+def on_boxes(shape: tuple[int, int], boxes: SeenBoxes) -> Bool:
     """Return the pixels of a camera of ``shape`` rows and columns whose ray meets a box."""
     out: Bool = np.zeros(shape, bool)
-    for ray, eye, walls, pixels in zip(*seen, strict=True):
+    for ray, eye, walls, pixels in zip(*boxes, strict=True):
         _add_box(ray, eye, walls, pixels, out[slice(*pixels[:2]), slice(*pixels[2:])])
     return out
 

@@ -79,7 +79,7 @@ class GaussianCloud:
     antialias_px2: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        found = {}
+        shapes = {}
         for name in ("means", "quats", "scales", "opacities", "sh"):
             value = np.asarray(getattr(self, name))
             if value.dtype not in (np.float32, np.float64):
@@ -89,13 +89,13 @@ class GaussianCloud:
             value = value.view()
             value.flags.writeable = False
             object.__setattr__(self, name, value)
-            found[name] = value.shape
+            shapes[name] = value.shape
         n = self.means.shape[0] if self.means.ndim else -1
         colours = [(n, size, 3) for size in SH_SIZES]
         wanted = ((n, 3), (n, 4), (n, 3), (n,))
-        if n < 0 or tuple(found.values())[:4] != wanted or found["sh"] not in colours:
+        if n < 0 or tuple(shapes.values())[:4] != wanted or shapes["sh"] not in colours:
             raise InputError(
-                f"{n} means: {', '.join(f'{name} {shape}' for name, shape in found.items())}",
+                f"{n} means: {', '.join(f'{name} {shape}' for name, shape in shapes.items())}",
                 "give means (N,3), quats (N,4), scales (N,3), opacities (N,) and sh (N,K,3) with K in 1, 4, 9, 16",
             )
         if self.antialias_px2 not in (0.0, MIP_PX2, EPS2D_PX2):

@@ -89,9 +89,9 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
         box = actor.box
         half = np.array(box.size_m) / 2 + OUTSIDE_M
         if (reach > half).any(axis=1).mean() > SPILL:
-            own = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
+            extent = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
             raise InputError(
-                f"{actor.appearance}: Gaussians of {own} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
+                f"{actor.appearance}: Gaussians of {extent} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
                 "give the actor this size_m, in a file whose origin is the middle of the box",
             )
         parts = GaussianCloud.concatenate([cloud, _shadow(actor.box, actor.label)])
@@ -273,9 +273,9 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     angle = np.linspace(0, 2 * np.pi, 20 if cell_m < 0.3 else 8, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)]) * radius
     centres = np.array([[x, 0.0, bottom + radius] for x in wheel_x])
-    at = (centres[:, None] + ring[None]).reshape(-1, 3)
+    rim = (centres[:, None] + ring[None]).reshape(-1, 3)
     thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
-    tyres = _blobs(at, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
+    tyres = _blobs(rim, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
     body = _drawn(BODY_RGB, draw[0])
     seat = np.array([-0.12 * length, 0, bottom + 0.52 * height])
     bar = np.array([0.26 * length, 0, bottom + 0.60 * height])

@@ -266,10 +266,10 @@ def _coverage(
     mask = np.zeros(shape, np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
-    mine = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
-    start = strokes.start[mine]
-    end = strokes.end[mine]
-    width = strokes.width_m[mine]
+    chosen = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
+    start = strokes.start[chosen]
+    end = strokes.end[chosen]
+    width = strokes.width_m[chosen]
     direction = unit(end - start)
     left = left_of(direction) * (width / 2)[:, None]
     along = direction * 0.02

@@ -51,10 +51,10 @@ def build_street(site: Site, houses: Houses) -> list[SceneNode]:
     nodes = []
     for name, items in [*parts, ("sign", _signs(site))]:
         levels = []
-        for cell_m, cloud, at in items:
-            owned = site.owns(at)
+        for cell_m, cloud, cell_places in items:
+            owned = site.owns(cell_places)
             if owned.any():
-                tile = tile_numbers(at[owned] - site.low, TILE_M)
+                tile = tile_numbers(cell_places[owned] - site.low, TILE_M)
                 levels.append((cell_m, cloud.take(owned), tile))
         nodes += nodes_by_tile(name, levels, usual_cell_m=USUAL_CELL_M.get(name, 0.0))
     return nodes
@@ -158,14 +158,14 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
     n_wood = int(0.00022 * per_100m * h * w * 0.0625)
     wood = site.low + rng.random((n_wood, 2)) * np.array([w, h]) * 0.25
     wood = wood[_free(site, houses, wood, 17.0 if not site.highway else 14.0)]
-    at = np.concatenate([street, wood])
-    if len(at) == 0:
+    places = np.concatenate([street, wood])
+    if len(places) == 0:
         return []
-    m = len(at)
+    m = len(places)
     crown = rng.uniform(1.5, 2.4, m) * np.where(np.arange(m) < len(street), 1.0, 1.35)
     stem = rng.uniform(2.1, 3.0, m)
     leaf = LEAVES[rng.integers(len(LEAVES), size=m)] * rng.uniform(0.85, 1.15, (m, 1))
-    foot = site.world(at, 0.0 if site.highway else KERB_M)
+    foot = site.world(places, 0.0 if site.highway else KERB_M)
     items = []
     for cell_m, count in ((0.25, 520), (0.36, 170), (0.8, 48), (1.8, 14)):
         crowns, owner = _crowns(site, foot, crown, stem, leaf, count)
@@ -173,7 +173,7 @@ def _trees(site: Site, houses: Houses) -> list[Item]:
         trunks = rods(foot, top, 0.13, TRUNK_RGB, 0.5 if count > 100 else 4.0)
         away = np.linalg.norm(trunks.means[:, None, :2] - foot[None, :, :2], axis=2)
         owners = np.concatenate([owner, np.argmin(away, axis=1)])
-        items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), at[owners]))
+        items.append((cell_m, GaussianCloud.concatenate([crowns, trunks]), places[owners]))
     return items
 
 
@@ -201,13 +201,13 @@ def _crowns(
     return cloud_of(means, quats, scales, rgb, 0.92), owner
 
 
-def _free(site: Site, houses: Houses, at: F64, clear_m: float) -> Bool:
+def _free(site: Site, houses: Houses, places: F64, clear_m: float) -> Bool:
     """Return which places are off the road by ``clear_m``, not on actors' ground and outside
     houses.
     """
-    free = (site.look_up(site.off_road_m, at) >= clear_m) & ~site.look_up(site.taken, at)
+    free = (site.look_up(site.off_road_m, places) >= clear_m) & ~site.look_up(site.taken, places)
     for front, away in zip(houses.front, houses.away, strict=True):
-        d = at - front.mean(axis=0)
+        d = places - front.mean(axis=0)
         half = np.linalg.norm(front[1] - front[0]) / 2
         along = left_of(away)
         depth = d @ away
@@ -240,26 +240,26 @@ def lamp_posts(site: Site, houses: Houses) -> LampPosts:
             free = _free(site, houses, spot.xy, 0.3)
             feet.append(spot.xy[free])
             arms.append(-spot.away[free])
-    at = np.concatenate(feet)
+    post_places = np.concatenate(feet)
     arm = np.concatenate(arms)
-    foot = site.world(at)
+    foot = site.world(post_places)
     top = foot + np.array([0, 0, 6.8])
-    tip = site.world(at + 1.7 * arm)
+    tip = site.world(post_places + 1.7 * arm)
     tip[:, 2] = top[:, 2] + 0.35
-    return LampPosts(at, foot, top, tip)
+    return LampPosts(post_places, foot, top, tip)
 
 
 def _poles(site: Site, houses: Houses) -> list[Item]:
     """Set lamp posts along the road and the poles that the map names."""
-    at, foot, top, tip = lamp_posts(site, houses)
+    places, foot, top, tip = lamp_posts(site, houses)
     mapped = [p for p in site.scenario.lane_map.poles if len(p) > 1]
-    if len(at) == 0 and not mapped:
+    if len(places) == 0 and not mapped:
         return []
     starts = [foot, top, *[p[:-1] for p in mapped]]
     ends = [top, tip, *[p[1:] for p in mapped]]
     start = np.concatenate(starts)
     end = np.concatenate(ends)
-    owner = np.concatenate([at, at, *[site.frame.to_ground(p[:-1]) for p in mapped]])
+    owner = np.concatenate([places, places, *[site.frame.to_ground(p[:-1]) for p in mapped]])
     items = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         poles = rods(start, end, 0.085, POLE_RGB, step)
@@ -267,7 +267,11 @@ def _poles(site: Site, houses: Houses) -> list[Item]:
         piece = np.repeat(np.arange(len(start)), links)
         lamp = cloud_of(tip, IDENTITY, (0.22, 0.22, 0.07), (0.85, 0.85, 0.80))
         items.append(
-            (cell_m, GaussianCloud.concatenate([poles, lamp]), np.concatenate([owner[piece], at]))
+            (
+                cell_m,
+                GaussianCloud.concatenate([poles, lamp]),
+                np.concatenate([owner[piece], places]),
+            )
         )
     return items
 
@@ -280,7 +284,7 @@ def _signs(site: Site) -> list[Item]:
     if not signs:
         return []
     rng = site.rng("signs")
-    corners, rgbs, feet, tops, at = [], [], [], [], []
+    corners, rgbs, feet, tops, places = [], [], [], [], []
     for T, box in signs:
         sizes = np.array([box.length_m, box.width_m])
         thin = int(np.argmin(sizes))
@@ -294,22 +298,22 @@ def _signs(site: Site) -> list[Item]:
         for shift, share, rgb in ((0.0, 1.0, RIM_RGB), (1.0, 0.72, colour), (-1.0, 0.72, colour)):
             corners.append((plate * share + shift * normal) @ T[:3, :3].T + T[:3, 3])
             rgbs.append(rgb)
-            at.append(T[:2, 3])
+            places.append(T[:2, 3])
         foot = site.world(site.frame.to_ground(T[None, :2, 3]))[0]
         if 0.5 < T[2, 3] - foot[2] < 4.5:
             feet.append(foot)
             tops.append(T[:3, 3])
-    plan = site.frame.to_ground(np.array(at))
+    plan = site.frame.to_ground(np.array(places))
     items = []
     usual_m = USUAL_CELL_M["sign"]
     finer = [(usual_m / 2**n, 0.15 / 2**n) for n in halvings(site.scenario)]
     for cell_m, size in (*finer, (usual_m, 0.15), (0.4, 0.5)):
         plates, owner, _ = quad_surfels(np.stack(corners), np.stack(rgbs), size)
         clouds = [plates]
-        where = [plan[owner]]
+        owners = [plan[owner]]
         if feet:
             posts = rods(np.stack(feet), np.stack(tops), 0.04, POST_RGB, 3.0)
             clouds.append(posts)
-            where.append(site.frame.to_ground(posts.means.astype(np.float64)))
-        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(where)))
+            owners.append(site.frame.to_ground(posts.means.astype(np.float64)))
+        items.append((cell_m, GaussianCloud.concatenate(clouds), np.concatenate(owners)))
     return items

@@ -38,10 +38,10 @@ def marking_strokes(site: Site) -> Strokes:
     """Return all lane markings near the site's path."""
     lane_map = site.scenario.lane_map
     high = site.low + np.array(site.road.shape[::-1]) * CELL_M
-    every = [(site.frame.to_ground(line), mark_type) for line, mark_type in marking_lines(lane_map)]
+    edges = [(site.frame.to_ground(line), mark_type) for line, mark_type in marking_lines(lane_map)]
     lines = [
         edge
-        for edge in every
+        for edge in edges
         if np.all(edge[0].max(axis=0) > site.low) and np.all(edge[0].min(axis=0) < high)
     ]
     pieces = [
@@ -116,8 +116,8 @@ def _zebra(ring: F64) -> Strokes:
     if w < h:
         axis, across, w, h = across, axis, h, w
     n = max(1, int((w - 0.3) / (2 * BAR_M)))
-    at = (np.arange(n) - (n - 1) / 2) * 2 * BAR_M
-    centre = np.array([cx, cy]) + at[:, None] * axis
+    offsets_m = (np.arange(n) - (n - 1) / 2) * 2 * BAR_M
+    centre = np.array([cx, cy]) + offsets_m[:, None] * axis
     half = max(0.5 * h - 0.15, 0.3)
     return _strokes(centre - half * across, centre + half * across, BAR_M, WHITE)
 

@@ -300,12 +300,16 @@ def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
 
     def abreast(lane: Lane) -> int:
         count = 1
-        seen = {lane.lane_id}
+        visited = {lane.lane_id}
         for side in ("left_neighbour", "right_neighbour"):
-            at: Lane | None = lane
-            while at is not None and (name := getattr(at, side)) in lanes and name not in seen:
-                seen.add(name)
-                at = lanes[name]
+            neighbour: Lane | None = lane
+            while (
+                neighbour is not None
+                and (name := getattr(neighbour, side)) in lanes
+                and name not in visited
+            ):
+                visited.add(name)
+                neighbour = lanes[name]
                 count = count + 1
         return count
 
@@ -334,10 +338,10 @@ def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
     """
     off = site.off_road_m if beyond_m > 0 else site.off_road_m - site.inside_m
     mask = (off > beyond_m).astype(np.uint8)
-    found, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    rings, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     near = site.path_m < within_path_m
     lines = []
-    for ring in found:
+    for ring in rings:
         pixels = ring[:, 0, :]
         if len(pixels) < 4 * SMOOTH:
             continue

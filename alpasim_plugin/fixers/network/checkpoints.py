@@ -48,9 +48,9 @@ def load_weights(path: str | Path, sha256: str | None = None) -> StateDict:
     path = Path(path)
     refuse_shards(path)
     check_regular(path, WEIGHT_BYTES)
-    if sha256 is not None and (found := file_sha256(path)) != sha256.lower():
+    if sha256 is not None and (actual_sha256 := file_sha256(path)) != sha256.lower():
         raise InputError(
-            f"{path}: sha256 {found}, not {sha256.lower()}",
+            f"{path}: sha256 {actual_sha256}, not {sha256.lower()}",
             "download the file again or correct the expected digest",
         )
     with open_regular(path, WEIGHT_BYTES) as file:
@@ -60,9 +60,9 @@ def load_weights(path: str | Path, sha256: str | None = None) -> StateDict:
     if not head.endswith(b"{") and head.startswith((ZIP_MAGIC, PICKLE_MAGIC)):
         content = _load_pickle(path)
     else:
-        what = f"not a complete safetensors file of {path.stat().st_size} bytes"
+        failure = f"not a complete safetensors file of {path.stat().st_size} bytes"
         hint = "download or copy the file again; it is truncated or of another format"
-        with parsing(path, hint, what):
+        with parsing(path, hint, failure):
             content = load_file(path)
     return unwrap(content, str(path))
 
@@ -176,10 +176,10 @@ def channels_last(kernel: Tensor) -> Tensor:
     return kernel
 
 
-def listed(what: str, keys: Sequence[str]) -> str:
+def listed(heading: str, keys: Sequence[str]) -> str:
     """Return keys for an error message, the first `LISTED` by name; empty without keys."""
-    rest = f" and {len(keys) - LISTED} more" if len(keys) > LISTED else ""
-    return f"{what}: {', '.join(keys[:LISTED])}{rest}" if keys else ""
+    more = f" and {len(keys) - LISTED} more" if len(keys) > LISTED else ""
+    return f"{heading}: {', '.join(keys[:LISTED])}{more}" if keys else ""
 
 
 def _is_bookkeeping(key: str) -> bool:

@@ -56,21 +56,27 @@ class FinerWeights(nn.Module):
             for size in (h, w)
         )
         b, k = weight.shape[:2]
-        said = pixels(weight.flatten(0, 1).float(), DETAIL)
-        said = said.reshape(b, k, *said.shape[1:])
-        said = said[:, :, rows][:, :, :, columns]
-        seen = in_floats(references)
-        shown, holds = seen[..., :3], seen[..., 3:]
+        coarse_weight = pixels(weight.flatten(0, 1).float(), DETAIL)
+        coarse_weight = coarse_weight.reshape(b, k, *coarse_weight.shape[1:])
+        coarse_weight = coarse_weight[:, :, rows][:, :, :, columns]
+        reference_planes = in_floats(references)
+        colours, holds = reference_planes[..., :3], reference_planes[..., 3:]
         image = (render / HALF - 1 + change[:, rows][:, :, columns])[:, None]
         around = holds.sum(dim=1, keepdim=True) - holds
-        mean = ((holds * shown).sum(dim=1, keepdim=True) - holds * shown) / around.clamp(min=1e-3)
+        mean = ((holds * colours).sum(dim=1, keepdim=True) - holds * colours) / around.clamp(
+            min=1e-3
+        )
         others = around.clamp(max=1)
-        beyond = (shown - image) * holds, (shown - mean) * holds * others, (mean - image) * others
-        own, apart, far = (CONTRAST * part for part in beyond)
-        sizes = [part.abs().mean(dim=-1, keepdim=True) for part in (own, apart, far)]
-        said = said.clamp(-MOST, MOST) / 3
+        beyond = (
+            (colours - image) * holds,
+            (colours - mean) * holds * others,
+            (mean - image) * others,
+        )
+        from_image, apart, far = (CONTRAST * part for part in beyond)
+        sizes = [part.abs().mean(dim=-1, keepdim=True) for part in (from_image, apart, far)]
+        coarse_weight = coarse_weight.clamp(-MOST, MOST) / 3
         features = torch.cat(
-            [own, sizes[0], apart, sizes[1], sizes[2], holds, others, said], dim=-1
+            [from_image, sizes[0], apart, sizes[1], sizes[2], holds, others, coarse_weight], dim=-1
         )
         x = features.flatten(0, 1).to(self.first.weight.dtype)
         for layer in (self.first, self.second):

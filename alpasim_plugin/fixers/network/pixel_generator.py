@@ -321,10 +321,10 @@ class PixelGenerator(nn.Module):
         fine = torch.cat([cells(image, DETAIL) for image in details], dim=-1)
         stem = self.stem(coarse.to(dtype))
         detail = self.read(fine.to(dtype))
-        seen = None
+        reference_cells = None
         if self.blend is not None and references is not None:
-            seen = operations.gather_references(references, render)
-            at4, at2 = self.blend.features(seen)
+            reference_cells = operations.gather_references(references, render)
+            at4, at2 = self.blend.features(reference_cells)
             stem = stem + at4
             detail = detail + at2
 
@@ -343,8 +343,8 @@ class PixelGenerator(nn.Module):
 
         change = pixels(self.write(fine), DETAIL).float()
         heads = None
-        if self.blend is not None and seen is not None:
-            heads = self.blend(y, fine, seen)
+        if self.blend is not None and reference_cells is not None:
+            heads = self.blend(y, fine, reference_cells)
         return Repaired(render + change, hidden, heads)
 
     @classmethod

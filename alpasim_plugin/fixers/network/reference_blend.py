@@ -126,28 +126,28 @@ class ReferenceBlend(nn.Module):
         with torch.no_grad():
             self.write.bias[: DETAIL**2] = DOUBT
 
-    def features(self, seen: ReferenceCells) -> tuple[Tensor, Tensor]:
+    def features(self, cells: ReferenceCells) -> tuple[Tensor, Tensor]:
         """Return what the references add to the first layers: ``(B, H / 4, W / 4, coarse)`` and
         ``(B, H / 2, W / 2, detail)``.
         """
         dtype = self.stem.weight.dtype
-        return self.stem(seen.mean4.to(dtype)), self.read(seen.mean2.to(dtype))
+        return self.stem(cells.mean4.to(dtype)), self.read(cells.mean2.to(dtype))
 
-    def forward(self, y: Tensor, fine: Tensor, seen: ReferenceCells) -> BlendHeads:
+    def forward(self, y: Tensor, fine: Tensor, cells: ReferenceCells) -> BlendHeads:
         """Return how every reference enters the image.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
-            seen: What the references show.
+            cells: What the references show.
         """
         b = y.shape[0]
-        k = seen.each4.shape[0] // b
-        side = activation(_add_to_each(self.coarse(seen.each4.to(y.dtype)), y), inplace=True)
+        k = cells.each4.shape[0] // b
+        side = activation(_add_to_each(self.coarse(cells.each4.to(y.dtype)), y), inplace=True)
         alike = likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
         at4 = activation(self.align[1](at4), inplace=True)
-        joined = _add_to_each(self.own(seen.each2.to(fine.dtype)).add_(self.up(at4)), fine)
+        joined = _add_to_each(self.own(cells.each2.to(fine.dtype)).add_(self.up(at4)), fine)
         features = activation(self.head(activation(joined, inplace=True)), inplace=True)
         heads = self.write(features).unflatten(0, (b, k))
         weight, offset, correction = heads.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
@@ -155,20 +155,20 @@ class ReferenceBlend(nn.Module):
         return BlendHeads(weight, moved.view(offset.shape), correction)
 
 
-def likeness(sought: Tensor, shown: Tensor) -> Tensor:
+def likeness(sought: Tensor, candidates: Tensor) -> Tensor:
     """Compare features with those of the cells around, the mean of products over channels.
 
     Args:
         sought: ``(B, h, w, C)``.
-        shown: ``(B K, h, w, C)`` K references of each; beyond the border nothing is alike.
+        candidates: ``(B K, h, w, C)`` K references of each; beyond the border nothing is alike.
 
     Returns:
         ``(B K, h, w, (2 MATCH_CELLS + 1)^2)`` by row and column of the other cell.
     """
     h, w = sought.shape[1:3]
     reach = 2 * MATCH_CELLS + 1
-    around = F.pad(shown, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
-    each = sought[:, None].expand(-1, len(shown) // len(sought), -1, -1, -1).flatten(0, 1)
+    around = F.pad(candidates, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    each = sought[:, None].expand(-1, len(candidates) // len(sought), -1, -1, -1).flatten(0, 1)
     # The mean as a product: a sum over few channels is slow on a CPU.
     mean = sought.new_full((sought.shape[-1], 1), 1 / sought.shape[-1])
     return torch.cat(
@@ -240,11 +240,11 @@ def sources_of(repaired: Tensor, references: Tensor, heads: BlendHeads, scale: i
     if heads.finer is not None:
         weight = weight + larger(heads.finer.flatten(0, 1)[..., None], FINER_PX)[:, :h, :w]
     logit = (weight + holds.log()).view(b, k, h, w, 1)
-    own = torch.zeros_like(logit[:, :1])
+    image_logit = torch.zeros_like(logit[:, :1])
     return Sources(
         torch.cat([repaired[:, None], colour], dim=1),
-        torch.cat([own, logit], dim=1),
-        torch.cat([own + 1, holds.view(b, k, h, w, 1)], dim=1),
+        torch.cat([image_logit, logit], dim=1),
+        torch.cat([image_logit + 1, holds.view(b, k, h, w, 1)], dim=1),
     )
 
 
@@ -340,19 +340,19 @@ def gather_references(references: Tensor, render: Tensor) -> ReferenceCells:
             as bytes.
         render: ``(B, H, W, 3)`` in [-1, 1].
     """
-    seen = in_floats(references)
-    holds = seen[..., 3:]
-    each = torch.cat([(seen[..., :3] - render[:, None]) * holds, holds], dim=-1)
+    planes = in_floats(references)
+    holds = planes[..., 3:]
+    each = torch.cat([(planes[..., :3] - render[:, None]) * holds, holds], dim=-1)
     mean, flat = each.mean(dim=1), each.flatten(0, 1)
     return ReferenceCells(
         cells(mean, CELL), cells(mean, DETAIL), cells(flat, CELL), cells(flat, DETAIL)
     )
 
 
-def _add_to_each(each: Tensor, one: Tensor) -> Tensor:
+def _add_to_each(each: Tensor, image: Tensor) -> Tensor:
     """Add an image ``(B, ...)`` to each of K: ``(B K, ...)``, in place."""
-    parts = each.view(one.shape[0], -1, *one.shape[1:])
-    return parts.add_(one[:, None]).flatten(0, 1)
+    parts = each.view(image.shape[0], -1, *image.shape[1:])
+    return parts.add_(image[:, None]).flatten(0, 1)
 
 
 def _sampled(images: Tensor, offset: Tensor, side: int = DETAIL) -> Tensor:

@@ -122,8 +122,8 @@ def _on_host(threads: int | None, scene: PreparedMap, views: Sequence[View]) -> 
 def _on_card(device: Any, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
     from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles, size_of
 
-    seen = [(*seen_from(scene, camera, T, actors), rows) for camera, T, actors, rows in views]
-    return batched(seen, size_of, partial(draw_tiles, scene, device))
+    visible = [(*seen_from(scene, camera, T, actors), rows) for camera, T, actors, rows in views]
+    return batched(visible, size_of, partial(draw_tiles, scene, device))
 
 
 def seen_from(

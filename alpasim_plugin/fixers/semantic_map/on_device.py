@@ -141,7 +141,9 @@ def _strokes(rows: Tensor, cameras: Tensor) -> Tensor:
     places = cut[..., :2] * inverse
     half = 0.5 * pixels * style[..., :1]
     on_image = (places.amax(2) >= -half) & (places.amin(2) <= size + half)
-    seen = (depth >= NEAR_M).any(2) & (depth < DEPTH_MAX_M).any(2) & on_image.all(2, keepdim=True)
+    is_visible = (
+        (depth >= NEAR_M).any(2) & (depth < DEPTH_MAX_M).any(2) & on_image.all(2, keepdim=True)
+    )
     start, goal = (places * scale[:, :, None]).unbind(2)
     way = goal - start
     share = way / way.square().sum(2, keepdim=True).clamp(min=SHORTEST)
@@ -162,7 +164,7 @@ def _strokes(rows: Tensor, cameras: Tensor) -> Tensor:
         way,
         half.new_zeros(*half.shape[:2], 5),
     ]
-    return torch.where(seen, torch.cat(columns, dim=2), 0.0)
+    return torch.where(is_visible, torch.cat(columns, dim=2), 0.0)
 
 
 def _shapes(rows: Tensor, cameras: Tensor) -> Tensor:
@@ -180,8 +182,10 @@ def _shapes(rows: Tensor, cameras: Tensor) -> Tensor:
     places = seen_at[..., :2] / depth[..., None]
     low = torch.where(near < NEAR_M, -torch.inf, places.amin(2))
     high = torch.where(near < NEAR_M, torch.inf, places.amax(2))
-    seen = (volume != 0) & ((volume < 0) | (closed == 0)) & (near < DEPTH_MAX_M) & (far >= NEAR_M)
-    seen &= ((high >= 0) & (low <= cameras[:, None, 17:19])).all(2, keepdim=True)
+    is_visible = (
+        (volume != 0) & ((volume < 0) | (closed == 0)) & (near < DEPTH_MAX_M) & (far >= NEAR_M)
+    )
+    is_visible &= ((high >= 0) & (low <= cameras[:, None, 17:19])).all(2, keepdim=True)
     columns = [
         low,
         high,
@@ -193,4 +197,4 @@ def _shapes(rows: Tensor, cameras: Tensor) -> Tensor:
         planes.flatten(2),
         (planes * shade[..., None]).sum(2),
     ]
-    return torch.where(seen, torch.cat(columns, dim=2), 0.0)
+    return torch.where(is_visible, torch.cat(columns, dim=2), 0.0)

@@ -56,14 +56,17 @@ def actor_boxes(poses: Mapping[str, F64], actors: Sequence[Actor]) -> tuple[Acto
     Raises:
         InputError: A pose belongs to no actor.
     """
-    known = {actor.actor_id: actor for actor in actors}
-    missing = [key for key in poses if key not in known]
+    actors_by_id = {actor.actor_id: actor for actor in actors}
+    missing = [key for key in poses if key not in actors_by_id]
     if missing:
         raise InputError(
             f"actor {missing[0]}: a pose without a box",
             "give the scenario's actors",
         )
-    return tuple(ActorBox(pose, known[key].box, known[key].label) for key, pose in poses.items())
+    return tuple(
+        ActorBox(pose, actors_by_id[key].box, actors_by_id[key].label)
+        for key, pose in poses.items()
+    )
 
 
 @dataclass(frozen=True)
@@ -119,9 +122,10 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
                 f"{name}: an array of shape {outline.shape}", "give points (N, 3), metres, world"
             )
         if not np.isfinite(outline).all():
-            at = int(np.flatnonzero(~np.isfinite(outline).all(axis=1))[0])
+            bad_point = int(np.flatnonzero(~np.isfinite(outline).all(axis=1))[0])
             raise InputError(
-                f"{name}: point {at} is {outline[at].tolist()}", "repair or drop this line"
+                f"{name}: point {bad_point} is {outline[bad_point].tolist()}",
+                "repair or drop this line",
             )
     for pose, box in lane_map.signs:
         require_rigid(pose, "sign")
@@ -202,13 +206,13 @@ def _offset_left(line: F64, left_m: float) -> F64:
     line = line[np.concatenate([[True], keep])]
     direction = step[keep] / length[keep, None]
     normal = left_of(direction)
-    both = np.concatenate([normal[:1], normal[:-1] + normal[1:], normal[-1:]])
-    both /= np.maximum(np.linalg.norm(both, axis=1), 1e-9)[:, None]
+    miter = np.concatenate([normal[:1], normal[:-1] + normal[1:], normal[-1:]])
+    miter /= np.maximum(np.linalg.norm(miter, axis=1), 1e-9)[:, None]
     cosine = np.maximum(
-        np.concatenate([[1.0], np.sum(both[1:-1] * normal[1:], axis=1), [1.0]]), 0.5
+        np.concatenate([[1.0], np.sum(miter[1:-1] * normal[1:], axis=1), [1.0]]), 0.5
     )
     out = line.copy()
-    out[:, :2] += both * (left_m / cosine)[:, None]
+    out[:, :2] += miter * (left_m / cosine)[:, None]
     return out
 
 

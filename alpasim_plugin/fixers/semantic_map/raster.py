@@ -174,12 +174,12 @@ def _draw_shape(shape, band_row, height, width, depth, colour):
         low = max(min(x[0], x[1], x[2]) - 1.0, 0.0)
         high = min(max(x[0], x[1], x[2]) + 1.0, np.float64(width))
         for a, c, xk, yk in edges:  # cut the row at each edge, a little outside
-            rest = c * (yc - yk) + SLACK * (abs(a) + abs(c))
+            slack_left = c * (yc - yk) + SLACK * (abs(a) + abs(c))
             if a > 0.0:
-                low = max(low, xk - rest / a - 1.0)
+                low = max(low, xk - slack_left / a - 1.0)
             elif a < 0.0:
-                high = min(high, xk - rest / a + 1.0)
-            elif rest < 0.0:
+                high = min(high, xk - slack_left / a + 1.0)
+            elif slack_left < 0.0:
                 high = -1.0
         r0 = c0 * (yc - y[1]) - a0 * x[1]
         r1 = c1 * (yc - y[2]) - a1 * x[2]

@@ -77,13 +77,13 @@ def draw_tiles(
                 t = tl.minimum(tl.maximum(a, 0.0), 1.0)
                 across = sample_x - tl.load(p + 20) - t * tl.load(p + 22)
                 down = sample_y * stretch - tl.load(p + 21) - t * tl.load(p + 23)
-                drawn = across * across + down * down <= half * fade * (half * fade)
+                covered = across * across + down * down <= half * fade * (half * fade)
                 inverse = tl.broadcast_to(middle, (TILE * TILE, 4))
             else:
                 b = tl.load(p + 20) * sample_x + tl.load(p + 21) * sample_y + tl.load(p + 22)
                 c = tl.load(p + 23) * sample_x + tl.load(p + 24) * sample_y + tl.load(p + 25)
                 inverse = ix * sample_x + iy * sample_y + i0
-                drawn = (a >= 0.0) & (b >= 0.0) & (c >= 0.0) & (inverse * _NEAR_M <= 1.0)
+                covered = (a >= 0.0) & (b >= 0.0) & (c >= 0.0) & (inverse * _NEAR_M <= 1.0)
                 inverse = tl.minimum(tl.maximum(inverse, farthest), nearest)
             inverse = inverse / tl.maximum(1.0 - tl.load(p + 9) * inverse, 1e-3)
             packed = tl.full((TILE * TILE, 1), 0, tl.int32)
@@ -91,7 +91,7 @@ def draw_tiles(
                 front = tl.load(p + 10 + channel)
                 level = (front + share * (tl.load(p + 13 + channel) - front)) * fade
                 packed |= (level + 0.5).to(tl.int32) << (8 * channel)
-            nearer = drawn & (inverse.to(tl.float32) > depth)
+            nearer = covered & (inverse.to(tl.float32) > depth)
             depth = tl.where(nearer, inverse.to(tl.float32), depth)
             colour = tl.where(nearer, packed, colour)
     inside = (row < rows) & (column < width)

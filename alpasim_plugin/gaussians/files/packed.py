@@ -258,16 +258,18 @@ def read_spz(path: Path | str) -> GaussianArrays:
     header = _parse_header(path, data)
     if header.version == 4:
         table = struct.unpack_from("<I", data, 16)[0]
-        at = table + 16 * data[15]
+        offset = table + 16 * data[15]
         streams = []
         for i, need in enumerate(header.stream_bytes):
             if need == 0:
                 streams.append(np.zeros(0, np.uint8))
                 continue
             packed = struct.unpack_from("<Q", data, table + 16 * i)[0]
-            plain = unzstd(data[at : at + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN)
+            plain = unzstd(
+                data[offset : offset + packed], need, f"{path}, stream {i}", _EXPORT_AGAIN
+            )
             streams.append(np.frombuffer(plain, dtype=np.uint8))
-            at += packed
+            offset += packed
         extensions = data[32 : struct.unpack_from("<I", data, 16)[0]]
     else:
         body = np.frombuffer(data, dtype=np.uint8, offset=16)
@@ -363,8 +365,8 @@ def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
         w = np.sqrt(np.maximum(1.0 - np.sum(xyz**2, axis=1, keepdims=True), 0.0))
         quats = np.concatenate([w, xyz], axis=1)
     dc = (colours.reshape(n, 1, 3) / 255.0 - 0.5) / _COLOUR_SCALE
-    rest = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
-    sh = np.concatenate([dc, rest], axis=1).astype(np.float32)
+    higher = (harmonics.reshape(n, k - 1, 3).astype(np.float64) - 128.0) / 128.0
+    sh = np.concatenate([dc, higher], axis=1).astype(np.float32)
     return GaussianArrays(
         means=means,
         quats=quats,

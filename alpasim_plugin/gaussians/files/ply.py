@@ -85,8 +85,8 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     n_rest, unsure = _check_properties(header, chosen)
     for beside in header.elements:  # refuse what may change what is drawn
         linear = beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]
-        known = beside.name.startswith("vertex") or beside.name in _BESIDE
-        if linear or (beside.count and not known):
+        is_harmless = beside.name.startswith("vertex") or beside.name in _BESIDE
+        if linear or (beside.count and not is_harmless):
             found = "linear colours" if linear else f"{beside.count} rows of unknown meaning"
             raise InputError(
                 f"{header.path}, element {beside.name!r}: {found}",
@@ -194,14 +194,14 @@ def write_points(path: Path, xyz: F64, rgb: U8) -> None:
 def ply_rows(cloud: GaussianCloud) -> NDArray[np.void]:
     """Return the rows ``(N,)`` of the vertex element that `write_ply` stores."""
     n, k = cloud.sh.shape[:2]
-    rest = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
+    higher = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
     with np.errstate(divide="ignore"):
         log_scales = np.log(np.asarray(cloud.scales, np.float64))
     groups: list[tuple[Sequence[str], FloatArray]] = [
         (("x", "y", "z"), np.asarray(cloud.means)),
         (("nx", "ny", "nz"), np.zeros((n, 3))),
         ([f"f_dc_{i}" for i in range(3)], np.asarray(cloud.sh)[:, 0, :]),
-        ([f"f_rest_{i}" for i in range(3 * (k - 1))], rest),
+        ([f"f_rest_{i}" for i in range(3 * (k - 1))], higher),
         (("opacity",), logit(np.asarray(cloud.opacities))[:, None]),
         ([f"scale_{i}" for i in range(3)], log_scales),
         ([f"rot_{i}" for i in range(4)], np.asarray(cloud.quats)),
@@ -301,8 +301,10 @@ def _sh_from_columns(rows: NDArray[np.void], n_rest: int) -> FloatArray:
     dc = _columns(rows, [f"f_dc_{i}" for i in range(3)])
     if not n_rest:
         return dc[:, None, :]
-    rest = _columns(rows, [f"f_rest_{i}" for i in range(3 * n_rest)]).reshape(len(rows), 3, n_rest)
-    return np.concatenate([dc[:, None, :], np.swapaxes(rest, 1, 2)], axis=1)
+    higher = _columns(rows, [f"f_rest_{i}" for i in range(3 * n_rest)]).reshape(
+        len(rows), 3, n_rest
+    )
+    return np.concatenate([dc[:, None, :], np.swapaxes(higher, 1, 2)], axis=1)
 
 
 _MAX_HEADER_BYTES = 1 << 20
@@ -385,7 +387,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     lines, body_offset = _header_lines(path)
     form = ""
     comments = []
-    found: list[tuple[str, int, list[tuple[str, str] | None]]] = []
+    element_rows: list[tuple[str, int, list[tuple[str, str] | None]]] = []
     for number, line in enumerate(lines, start=1):
         match line.split():
             case [] | ["ply" | "end_header", *_]:
@@ -397,13 +399,13 @@ def read_ply_header(path: Path | str) -> PlyHeader:
             case ["element", name, count] if count.isascii() and count.isdigit():
                 rows = int(count[:20])
                 GAUSSIANS.check(rows, f"{path}, line {number}", "element count")
-                found.append((name, rows, []))
-            case ["property", "list", *_] if found:
-                found[-1][2].append(None)
-            case ["property", word, name, *_] if found and form and word in _SCALAR_CODES:
+                element_rows.append((name, rows, []))
+            case ["property", "list", *_] if element_rows:
+                element_rows[-1][2].append(None)
+            case ["property", word, name, *_] if element_rows and form and word in _SCALAR_CODES:
                 # CloudCompare puts scalar_ before every name.
                 code = _BYTE_ORDERS[form] + _SCALAR_CODES[word]
-                found[-1][2].append((name.removeprefix("scalar_"), code))
+                element_rows[-1][2].append((name.removeprefix("scalar_"), code))
             case _:
                 raise InputError(
                     f"{path}, line {number}: a line that means nothing here: {line[:80]!r}",
@@ -414,7 +416,7 @@ def read_ply_header(path: Path | str) -> PlyHeader:
     text = form == "ascii"
     elements = []
     offset: int | None = 0 if text else body_offset
-    for name, rows, fields in found:
+    for name, rows, fields in element_rows:
         scalars = [field for field in fields if field is not None]
         with parsing(path, _EXPORT_AGAIN, f"element {name!r}"):
             dtype = np.dtype(scalars) if len(scalars) == len(fields) else None
