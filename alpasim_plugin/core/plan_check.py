@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from alpasim_plugin.core.types import (
+    I64,
     CameraSpec,
     Degradation,
     Environment,
@@ -25,6 +26,8 @@ from alpasim_plugin.core.types import (
 )
 
 REACH_M = 20_000.0  # of a plan, from where it is made
+LONGEST_S = 600.0  # of a plan; what is longer counts in nanoseconds
+STALE_S = 10.0  # between now and the first pose that somebody else's clock gave a plan
 ARRAYS = ("times_us", "xy", "yaw")
 UNITS = (
     (100.0, "centimetres"),
@@ -107,12 +110,37 @@ def plan_problem(plan: Any, now_us: int) -> str:
         return f"times_us is {plan.times_us.dtype}, not integer microseconds"
     if int(plan.times_us[0]) != now_us:
         return f"times_us starts at {int(plan.times_us[0])} us, the observation is at {now_us} us"
+    reach_s = (int(plan.times_us[-1]) - now_us) * 1e-6
+    if reach_s > LONGEST_S:
+        return f"the plan reaches {reach_s:,.0f} s ahead: its times are not in microseconds"
     steps = np.diff(plan.times_us.astype(np.int64))
     return (
         f"times_us does not increase strictly after row {int(np.argmax(steps <= 0))}"
         if (steps <= 0).any()
         else ""
     )
+
+
+def clock_problem(times_us: I64, now_us: int) -> str:
+    """Say what is wrong with the absolute times of a plan that another process made for ``now_us``:
+    its clock, or its unit of time, is another one; empty if nothing.
+
+    Args:
+        times_us: ``(T,)`` increasing, T at least 1.
+        now_us: When it was asked for.
+
+    Example:
+        >>> clock_problem(np.array([1_700_000_000]), 1_700_000_000_000_000)
+        'the plan ends 1,699,998,300 s before now: times are microseconds of the clock of the query'
+    """
+    before_s = (now_us - int(times_us[-1])) * 1e-6
+    away_s = (int(times_us[0]) - now_us) * 1e-6
+    found = ""
+    if before_s > 0:
+        found = f"the plan ends {before_s:,.0f} s before now"
+    elif abs(away_s) > STALE_S:
+        found = f"the plan begins {away_s:,.0f} s from now"
+    return f"{found}: times are microseconds of the clock of the query" if found else ""
 
 
 def _a(value: Any) -> str:

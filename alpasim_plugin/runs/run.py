@@ -33,8 +33,10 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.run_folder.writer import unfinish, write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
+from alpasim_plugin.runs.cell import users_parts
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
+from alpasim_plugin.runs.local_executor import prepare_workers
 from alpasim_plugin.runs.plan import RunPlan
 from alpasim_plugin.runs.policy_checks import check_policies, hanging
 from alpasim_plugin.runs.provenance import hardware, project, versions
@@ -194,6 +196,8 @@ def execute_run(
         progress.started(plan, root, threads)
         began = time.perf_counter()
         how = HowToRun(threads, resume, limit_s, executor)
+        if executor.is_local and (threads.workers > 1 or any(map(users_parts, plan.cells))):
+            prepare_workers(threads.per_worker)
         known = held.get("policy_checks") or {}
         try:
             checks = check_policies(plan, known, how, progress.noticed)

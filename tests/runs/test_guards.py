@@ -7,7 +7,7 @@ import pytest
 
 from alpasim_plugin.core.errors import PolicyError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.plan_check import plan_problem
+from alpasim_plugin.core.plan_check import clock_problem, plan_problem
 from alpasim_plugin.core.types import Frame, Plan
 from alpasim_plugin.renderers import make_renderer
 from alpasim_plugin.runs.cameras import recorded_requests
@@ -76,3 +76,30 @@ def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure():
     times_us = np.array([0, 1], np.int64)
     samples = (np.full((2, 3), 1e30),)
     assert plan_problem(Plan(0, times_us, np.zeros((2, 2)), np.zeros(2), samples=samples), 0)
+
+
+NOW_US = 1_700_000_000_000_000
+AHEAD_US = np.arange(0, 5_000_001, 500_000)
+
+
+@pytest.mark.parametrize(
+    "times_us",
+    [
+        (NOW_US + AHEAD_US) // 1000,
+        (NOW_US + AHEAD_US) * 1000,
+        AHEAD_US,
+        NOW_US + 20_000_000 + AHEAD_US,
+        NOW_US - 6_000_000 + AHEAD_US,
+    ],
+    ids=["milliseconds", "nanoseconds", "own clock", "later", "over"],
+)
+def test_a_plan_of_another_clock_is_refused(times_us):
+    assert clock_problem(times_us, NOW_US)
+    assert clock_problem(NOW_US + AHEAD_US, NOW_US) == ""
+    assert clock_problem(NOW_US - 400_000 + AHEAD_US, NOW_US) == "", "made for an earlier query"
+
+
+def test_a_plan_that_counts_in_nanoseconds_is_the_policys_failure():
+    times_us = NOW_US + 1000 * AHEAD_US
+    plan = Plan(NOW_US, times_us, np.zeros((len(times_us), 2)), np.zeros(len(times_us)))
+    assert "not in microseconds" in plan_problem(plan, NOW_US)

@@ -21,6 +21,7 @@ from alpasim_plugin.alpasim.client.channel import Address, Service, encoding_of
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import interpolate, inverse, se3, wrap_angle, yaw_of
 from alpasim_plugin.core.interfaces import Policy
+from alpasim_plugin.core.plan_check import clock_problem
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -207,7 +208,13 @@ class DriverPolicy(Policy):
                     "lengthen timing.warmup_us until the driver has the frames that it needs",
                 )
             return straight_on(now, observation.ego.speed_mps)
-        times, rows = in_rig(self._read(answer.trajectory, "the driver's plan"), observation)
+        planned = self._read(answer.trajectory, "the driver's plan")
+        problem = clock_problem(planned.t_us, now)
+        if problem:
+            raise PolicyError(
+                f"{self.service.target}: {problem}", "send the times of the query's clock"
+            )
+        times, rows = in_rig(planned, observation)
         reach = (int(times[-1]) - now) * 1e-6
         shortest = self._facts["shortest_plan_s"]
         self._facts["shortest_plan_s"] = reach if shortest is None else min(shortest, reach)
