@@ -73,24 +73,10 @@ def upper_bound(values: F64, most: float) -> float:
         >>> round(upper_bound(np.zeros(10), 1.0), 4)  # Clopper-Pearson of 0 in 10
         0.3085
     """
-    scale = max(float(np.max(np.abs(values))), abs(most))
+    scale = _scale(values, most)
     if scale == 0.0:
         return most
-    # The different values, with the worst as one more. Many are put into bins that keep their mean:
-    # one between two edges counts in shares for both, which widens the bounds and never narrows.
-    distinct, found = np.unique(
-        np.append(np.asarray(values, np.float64) / scale, most / scale), return_counts=True
-    )
-    counts = found.astype(np.float64)
-    if len(distinct) > BINS:
-        edges = np.linspace(distinct[0], distinct[-2], BINS)
-        place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])
-        left = np.minimum(place.astype(np.int64), BINS - 2)
-        share = place - left
-        filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
-            left + 1, share * counts[:-1], BINS
-        )
-        distinct, counts = np.append(edges, distinct[-1]), np.append(filled, counts[-1])
+    distinct, counts = _with_worst(values, most, scale)
     low = float(np.mean(np.asarray(values) / scale))
     if low >= distinct[-1]:
         return most
@@ -100,13 +86,60 @@ def upper_bound(values: F64, most: float) -> float:
     return min(scale * float(root), most)
 
 
+def chance_of_mean(values: F64, most: float, mean: float) -> float:
+    """Return a p-value against "the mean is at least ``mean``"; at 2.5 % it agrees with
+    `upper_bound`.
+
+    Args:
+        values: ``(n,)`` independent values, none above ``most``.
+        most: The greatest possible value.
+        mean: The hypothesis.
+
+    Example:
+        >>> round(chance_of_mean(np.zeros(36), 1.0, 0.1), 4)  # 0.9^36
+        0.0225
+    """
+    scale = _scale(values, most)
+    if scale == 0.0:
+        return float(mean <= 0.0)
+    return chance_above(*_with_worst(values, most, scale), mean / scale)
+
+
+def _scale(values: F64, most: float) -> float:
+    """Return the largest size of the values and of the greatest possible one."""
+    return max(float(np.max(np.abs(values))), abs(most))
+
+
+def _with_worst(values: F64, most: float, scale: float) -> tuple[F64, F64]:
+    """Return the different values, divided by ``scale``, with the worst as one more, and their
+    counts.
+
+    Many are put into bins that keep their mean: one between two edges counts in shares for both,
+    which widens the bounds and never narrows.
+    """
+    distinct, found = np.unique(
+        np.append(np.asarray(values, np.float64) / scale, most / scale), return_counts=True
+    )
+    counts = found.astype(np.float64)
+    if len(distinct) <= BINS:
+        return distinct, counts
+    edges = np.linspace(distinct[0], distinct[-2], BINS)
+    place = (distinct[:-1] - edges[0]) / (edges[1] - edges[0])
+    left = np.minimum(place.astype(np.int64), BINS - 2)
+    share = place - left
+    filled = np.bincount(left, (1.0 - share) * counts[:-1], BINS) + np.bincount(
+        left + 1, share * counts[:-1], BINS
+    )
+    return np.append(edges, distinct[-1]), np.append(filled, counts[-1])
+
+
 def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
     """Return the 95 % bounds of a mean from independent ``(n,)`` values that lie between ``least``
     and ``most``.
 
     Example:
         >>> [round(bound, 3) for bound in mean_bounds(np.array([0.0] * 57 + [1.0] * 3), -1.0, 1.0)]
-        [-0.028, 0.139]
+        [-0.026, 0.139]
     """
     x = np.clip(np.asarray(values, np.float64), least, most)
     return -upper_bound(-x, -least), upper_bound(x, most)
