@@ -30,8 +30,9 @@ from evaluators.statistics.suite import (
     LISTED,
     ROUNDING,
     Change,
-    chances,
+    Noise,
     change_of,
+    noises_of,
     seeds_that_decide,
     verdict_of,
 )
@@ -88,6 +89,10 @@ class MetricRule(_Strict):
     def is_paired(self) -> bool:
         """Tell whether the rule compares with a baseline."""
         return self.margin is not None or self.max_new is not None
+
+    def new_of(self, accepted: int) -> int:
+        """Return the new events accepted: the rule's own number, or that of the gate."""
+        return accepted if self.max_new is None else self.max_new
 
     def margin_of(self, metric: MetricInfo) -> float:
         """Return the accepted change: the rule's own, or what the metric names."""
@@ -203,7 +208,7 @@ UNNAMED = MetricRule(margin=0.0)  # of an event that ends the scored part
 SCENES = "about all scenes that these were drawn from"
 SUITE = {
     True: "about these scenes and seeds: what changed is a fact",
-    False: "about these scenes; the policy is not repeatable: exact tests over seeds",
+    False: "about these scenes; the policy is not repeatable: events by exact tests over seeds, other metrics by the mean of drives cut at three margins",
     None: "about these scenes and seeds; run --repeat has not tried whether the policy is repeatable",
 }
 CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
@@ -464,12 +469,13 @@ def _of_suite(
         accepted = rules[name].margin_of(metric) if name in rules else metric.accepted
         changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
     is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
-    p_values: Sequence[float | None] = [None] * len(changes)
+    accepted_rules = [rules.get(change.metric.name, UNNAMED) for change in changes]
+    noises: Sequence[Noise | None] = [None] * len(changes)
     if is_noisy and not is_equal:
-        p_values = chances(changes)
+        noises = noises_of(changes, [rule.new_of(spec.max_new) for rule in accepted_rules])
     checks = [
-        _suite_check(pair, change, rules.get(change.metric.name, UNNAMED), p, spec)
-        for change, p in zip(changes, p_values, strict=True)
+        _suite_check(pair, change, rule, noise, spec)
+        for change, rule, noise in zip(changes, accepted_rules, noises, strict=True)
     ]
     if any(check.cause == "regression" for check in checks):
         # It decides; the rollouts that it cut short need not be compared.
@@ -489,11 +495,11 @@ def _of_suite(
 
 
 def _suite_check(
-    pair: _Pair, change: Change, rule: MetricRule, p: float | None, spec: GateSpec
+    pair: _Pair, change: Change, rule: MetricRule, noise: Noise | None, spec: GateSpec
 ) -> Check:
     metric = change.metric
-    max_new = spec.max_new if rule.max_new is None else rule.max_new
-    verdict = verdict_of(change, p, max_new)
+    max_new = rule.new_of(spec.max_new)
+    verdict = verdict_of(change, max_new, noise)
     n_cells = int(np.sum(change.is_pair))
     n_missing = len(change.missing)
     if metric.is_flag:
@@ -508,14 +514,16 @@ def _suite_check(
         "diff": diff if n_cells else None,
         "margin": change.margin,
         "max_new": max_new,
-        "p_value": p,
+        "p_value": None if noise is None else noise.p_value,
+        "cut_mean": None if noise is None else noise.cut_mean,
+        "beyond": None if noise is None else noise.beyond,
         "verdict": verdict,
         "n_cells": n_cells,
         "n_scenes": len(change.by_scene(change.now)),
         "n_missing": n_missing,
         "n_neither": change.n_neither,
         "n_short": change.n_short,
-        "n_far": 0 if metric.is_flag and p is None else change.n_far,
+        "n_far": 0 if metric.is_flag or noise is not None else change.n_far,
         "counts": counts | {"equal": n_equal},
         "worst": change.worst(),
         "cut": [

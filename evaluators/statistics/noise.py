@@ -7,10 +7,10 @@ worse. Three things are told apart, each with an error of its own:
 - **The cut mean.** Of a distance or of `progress` it is the mean of the harms of all cells, each cut
   at `CUT_MARGINS` margins. No sample bounds the mean of what is not cut: one drive in forty that
   leaves the road by four metres moves it by 0.1 m, and 14 drives show none of them in 70 % of runs.
-- **Drives beyond the cut** are an event. One is red if nothing else in the run is as uneven: no
-  other harm or gain is larger than one margin. Otherwise the policy's own noise may be the cause; one
-  that no gain answers then keeps the gate from being green, and the exact sign test of harms and
-  gains beyond the cut makes it red. The rate that the drives leave open is printed.
+- **Drives beyond the cut** are an event. One is red if the rest of the run is quiet: no other harm or
+  gain is larger than one margin, or than a fifth of it. Otherwise the policy's own noise may be the
+  cause; one that no gain answers then keeps the gate from being green, and the exact sign test of
+  harms and gains beyond the cut makes it red. The rate that the drives leave open is printed.
 - **Events** are compared by their exact test.
 
 Sources: Gaffke (see `evaluators.statistics.bounded`); Tango, Statistics in Medicine 17, 1998, whose
@@ -33,7 +33,11 @@ from evaluators.statistics.bounded import chance_of_mean
 from evaluators.statistics.intervals import TAIL
 
 CUT_MARGINS = 3.0  # at which the harm of a cell is cut
+# A drive beyond the cut is no noise of a run whose other cells differ by so many times less: with the
+# heavy tails of t(3) it happens in half a percent of runs.
+APART = 5.0
 RATE_LEVEL = 0.95  # of the printed rate of drives beyond the cut, one-sided
+OUTSIDE = 0.0005  # chance that the rate of gone events is none of them
 NUISANCE = 200  # rates of gone events at which the error of the test of events is computed
 HALVINGS = 40
 MOST_SEEDS = 100  # that are asked for
@@ -80,7 +84,8 @@ class Beyond:
         n_worse: Cells that are worse by more than `CUT_MARGINS` margins.
         n_better: Cells that are better by more.
         n: All cells.
-        is_quiet: No other cell is worse or better by more than one margin.
+        is_quiet: No other cell is worse or better by more than one margin, or than the worst one
+            divided by `APART`.
     """
 
     n_worse: int
@@ -120,7 +125,8 @@ def beyond(harms: F64, margin: float, rounding: float = 0.0) -> Beyond:
     most = CUT_MARGINS * margin + rounding
     is_worse = harms > most
     others = np.abs(harms[~is_worse])
-    is_quiet = bool((others <= margin + rounding).all())
+    largest = max(margin + rounding, float(np.max(harms, initial=0.0)) / APART)
+    is_quiet = bool((others <= largest).all())
     return Beyond(int(np.sum(is_worse)), int(np.sum(harms < -most)), len(harms), is_quiet)
 
 
@@ -167,9 +173,9 @@ def chance_at_rate(new: int, gone: int, n: int, margin: float) -> float:
     small one shows that the variant is within the margin.
 
     The outcomes that speak at least as strongly against it are those with a Tango score that is no
-    higher. Their probability is the largest over all rates of gone events, so that the error holds
-    for every one of them; Tango's normal quantile passes 2.5 % by a little (2.6 % at 30 % of
-    events).
+    higher. Their probability is the largest over the rates of gone events that are possible, so that
+    the error holds for every one of them (Berger and Boos, Journal of the American Statistical
+    Association 89, 1994); Tango's normal quantile passes 2.5 % by a little (2.6 % at 30 % of events).
 
     Args:
         new, gone: Cells of ``n`` that have the event on one side only.
@@ -178,14 +184,14 @@ def chance_at_rate(new: int, gone: int, n: int, margin: float) -> float:
 
     Example:
         >>> round(chance_at_rate(0, 0, 36, 0.1), 4)  # 0.9^36 = 0.0225 where nothing may be gone
-        0.0236
+        0.0232
     """
     if n == 0 or margin <= 0.0 or margin >= 1.0:
         return float(margin < 1.0)
     # The score rises with new events, so that for each number of gone ones the outcomes in question
     # are those up to some number of new ones; -1 where there is none.
     numbers = np.arange(n + 1, dtype=np.float64)
-    bar = float(tango_score(np.float64(new), np.float64(gone), n, margin)) + 1e-9
+    bar = float(tango_score(np.array(float(new)), np.array(float(gone)), n, margin)) + 1e-9
     low = np.full(n + 1, -1.0)
     high = n - numbers
     for _ in range(HALVINGS):
@@ -195,8 +201,15 @@ def chance_at_rate(new: int, gone: int, n: int, margin: float) -> float:
         high = np.where(is_in, high, np.maximum(middle - 1.0, low))
         if (low >= high).all():
             break
-    # Rates of gone events are closer together near 0, where the probability bends.
-    rates = 0.5 * (1.0 - margin) * np.linspace(0.0, 1.0, NUISANCE)[:, None] ** 2
+    # The rates of gone events that those seen leave open but for a chance of `OUTSIDE`, which is
+    # added; closer together near 0, where the probability bends.
+    most = 0.5 * (1.0 - margin)
+    least_rate = 0.0
+    if gone > 0:
+        least_rate = float(scipy.special.betaincinv(gone, n - gone + 1, 0.5 * OUTSIDE))
+    most_rate = min(rate_at_most(gone, n, 1.0 - 0.5 * OUTSIDE), most)
+    roots = np.linspace(min(least_rate, most) ** 0.5, most_rate**0.5, NUISANCE)
+    rates = roots[:, None] ** 2
     is_used = low >= 0.0
     gone_numbers = numbers[is_used]
     with np.errstate(divide="ignore"):
@@ -212,7 +225,7 @@ def chance_at_rate(new: int, gone: int, n: int, margin: float) -> float:
         )
     share_new = np.minimum((rates + margin) / (1.0 - rates), 1.0)
     up_to = scipy.special.bdtr(low[is_used], (n - gone_numbers).astype(np.int64), share_new)
-    return float(np.max(np.sum(np.exp(log_chance) * up_to, axis=1)))
+    return min(1.0, float(np.max(np.sum(np.exp(log_chance) * up_to, axis=1))) + OUTSIDE)
 
 
 def seeds_for_mean(harms: F64, margin: float, n_scenes: int) -> int | None:

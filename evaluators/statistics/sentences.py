@@ -76,6 +76,8 @@ def change_text(entry: JsonView, metric: MetricInfo) -> str:
         parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":
         parts.append(f"worst in {_some([_place(pair) for pair in entry['worst']])}")
+    if entry["cut_mean"] is not None:
+        parts.extend(_cut_texts(entry, scale, unit))
     if entry["n_far"]:
         parts.append(f"{plural(entry['n_far'], 'scene')} beyond three margins")
     if entry["cut"]:
@@ -89,9 +91,28 @@ def change_text(entry: JsonView, metric: MetricInfo) -> str:
         missing = f"{plural(entry['n_missing'], 'pair')} missing"
         parts.append(f"{missing}, first {_place(first)} ({first['why']})")
     if entry["verdict"] == "undecided":
-        seeds = plural(entry["seeds"], "seed") if entry["seeds"] else "more seeds"
-        parts.append(f"{seeds} a scene would show whether this is chance")
+        parts.append(_seeds_text(entry["seeds"]))
     return "; ".join(parts)
+
+
+def _cut_texts(entry: JsonView, scale: float, unit: str) -> list[str]:
+    """Say the mean of cells cut at three margins, and what lies beyond."""
+    cut = entry["cut_mean"] * scale
+    most = 3.0 * entry["margin"] * scale
+    drives = entry["beyond"]
+    at_most = 100 * drives["at_most"]
+    return [
+        f"mean of drives cut at {most:.3g} {unit}".rstrip() + f": {cut:+.3g}",
+        f"{drives['worse']} of {plural(drives['of'], 'drive')} beyond {most:.3g} {unit}".rstrip()
+        + f": at most {at_most:.0f}\u00a0%",
+    ]
+
+
+def _seeds_text(seeds: int | None) -> str:
+    """Say how many seeds would decide."""
+    if seeds is None:
+        return "no number of seeds would show from this that it is chance"
+    return f"{plural(seeds, 'seed')} a scene would show whether this is chance"
 
 
 def _place(pair: JsonView) -> str:

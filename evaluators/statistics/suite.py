@@ -2,14 +2,14 @@
 difference is a fact and not a sample: an event that is new in one scene is new, and a distance is
 compared with its margin.
 
-Only where the policy is not repeatable may a change be chance. Then the sign of a cell's
-difference is a fair coin if the variants are alike, whatever the distribution (sign-flip test).
-All events are flipped together and the largest statistic counts (Westfall and Young,
-Resampling-based multiple testing, 1993), and so are all other metrics; the two share 2.5 %, so
-that six new events and none gone are just enough.
+Only where the policy is not repeatable may a change be chance (`evaluators.statistics.noise`). Then
+a distance is judged by the mean of its cells cut at three margins, and what lies beyond is an event
+of its own. Whether events are more frequent is tested by the signs of what changed: if the variants
+are alike, each is a fair coin. All events are flipped together and the largest statistic counts
+(Westfall and Young, Resampling-based multiple testing, 1993); all other metrics share another level
+(Holm's method). Both levels make 2.5 %, so that six new events and none gone are just enough.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,16 +18,27 @@ import numpy as np
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
-from evaluators.statistics.intervals import TAIL, cluster_means, exact_rate
+from evaluators.statistics.intervals import TAIL, cluster_means
+from evaluators.statistics.noise import (
+    CUT_MARGINS,
+    Beyond,
+    beyond,
+    chance_at_margin,
+    chance_at_rate,
+    chance_within,
+    cut,
+    rate_at_most,
+    rejected_together,
+    seeds_for_mean,
+    seeds_for_rate,
+)
 from evaluators.statistics.paired import Pairs
 from evaluators.statistics.verdicts import Verdict, flipped_sums
 
 ROUNDING = 1e-9  # a smaller difference, relative, may come from another processor
-SCENE_MARGINS = 3.0  # that one scene may be worse
 LISTED = 50  # cells named of a check; counts are always whole
 EVENT_LEVEL = 2.0**-6  # six of six
 LEVEL = TAIL - EVENT_LEVEL  # of the other metrics
-MOST_SEEDS = 100  # that are asked for
 
 
 @dataclass(frozen=True)
@@ -87,9 +98,27 @@ class Change:
 
     @property
     def n_far(self) -> int:
-        """Count the scenes that are more than `SCENE_MARGINS` margins worse."""
-        most = SCENE_MARGINS * self.margin + ROUNDING
+        """Count the scenes that are more than `CUT_MARGINS` margins worse."""
+        most = CUT_MARGINS * self.margin + ROUNDING
         return sum(int(np.sum(self.by_scene(harm) > most)) for harm in self.harms)
+
+    @property
+    def of_cells(self) -> list[F64]:
+        """Give `harms` of the cells that are compared, ``(n,)`` each."""
+        return [harm[self.is_pair] for harm in self.harms]
+
+    @property
+    def cut_mean(self) -> float:
+        """Give the mean of the compared cells, each cut at `CUT_MARGINS` margins, with the sign that
+        makes positive worse; 0 where there is none.
+        """
+        harms = self.of_cells[0]
+        return float(np.mean(cut(harms, self.margin))) if len(harms) else 0.0
+
+    @property
+    def far_drives(self) -> list[Beyond]:
+        """Give what lies beyond the cut, for each of `harms`."""
+        return [beyond(harms, self.margin, ROUNDING) for harms in self.of_cells]
 
     def beyond(self, margin: float) -> Bool:
         """Return the cells ``(C,)`` that are worse by more than a margin."""
@@ -165,25 +194,76 @@ def _ran(side: Side) -> Bool:
 
 
 def chances(changes: Sequence[Change]) -> list[float]:
-    """Return for each metric the chance that any of its family (events, or other metrics) looks this
-    much worse if the variants are alike; of a distance: if it is no worse than its margin.
+    """Return for each metric of a policy that is not repeatable a p-value: of an event, the chance
+    that any event looks this much more frequent if the variants are alike; of another metric,
+    against "its cut mean is within the margin".
 
     Args:
         changes: Of one variant, in all metrics that are tested.
     """
     p = [1.0] * len(changes)
-    for is_flag in (True, False):
-        family = [
-            (i, np.where(change.is_pair, harm - (0.0 if is_flag else change.margin), 0.0))
-            for i, change in enumerate(changes)
-            for harm in change.harms
-            if change.metric.is_flag == is_flag
-        ]
-        if family:
-            found = flipped(np.array([row for _, row in family]))
-            for (i, _), chance in zip(family, found.tolist(), strict=True):
-                p[i] = min(p[i], chance)
+    events = [i for i, change in enumerate(changes) if change.metric.is_flag]
+    if events:
+        shares = flipped(np.array([changes[i].harms[0] for i in events]))
+        for i, chance in zip(events, shares.tolist(), strict=True):
+            p[i] = chance
+    for i, change in enumerate(changes):
+        if not change.metric.is_flag:
+            sides = [chance_within(harms, change.margin) for harms in change.of_cells]
+            p[i] = min(1.0, len(sides) * min(sides))
     return p
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the drives of a policy that is not repeatable show of one metric.
+
+    Attributes:
+        p_value: From `chances`.
+        is_worse: The metric is worse.
+        cut_mean: Mean of the cells cut at three margins, in the sign of the metric; None of an event.
+        beyond: ``worse``, ``better`` and ``of`` count drives beyond the cut; ``at_most`` is the
+            largest rate of worse ones that they leave open, one-sided 95 %. None of an event.
+    """
+
+    p_value: float
+    is_worse: bool
+    cut_mean: float | None
+    beyond: JsonView | None
+
+
+def noises_of(changes: Sequence[Change], max_new: Sequence[int]) -> list[Noise]:
+    """Return what the drives of a policy that is not repeatable show.
+
+    Args:
+        changes: Of one variant, in all metrics that are tested.
+        max_new: New events accepted of each.
+    """
+    p_values = chances(changes)
+    others = [i for i, change in enumerate(changes) if not change.metric.is_flag]
+    rejected = rejected_together([p_values[i] for i in others], LEVEL)
+    is_rejected = dict(zip(others, rejected, strict=True))
+    level = LEVEL / max(len(others), 1)
+    noises = []
+    for i, change in enumerate(changes):
+        if change.metric.is_flag:
+            is_more = change.n_new - change.n_gone > max_new[i]
+            is_worse = p_values[i] <= EVENT_LEVEL and is_more
+            noises.append(Noise(p_values[i], is_worse, None, None))
+            continue
+        drives = change.far_drives
+        is_worse = is_rejected[i] or any(one_side.is_red(level) for one_side in drives)
+        sign = -1.0 if change.metric.direction == "higher" else 1.0
+        counts = {
+            "worse": sum(one_side.n_worse for one_side in drives),
+            "better": drives[0].n_better if len(drives) == 1 else 0,
+            "of": drives[0].n,
+        }
+        at_most = rate_at_most(counts["worse"], counts["of"])
+        noises.append(
+            Noise(p_values[i], is_worse, sign * change.cut_mean, counts | {"at_most": at_most})
+        )
+    return noises
 
 
 def flipped(rows: F64) -> F64:
@@ -210,62 +290,48 @@ def flipped(rows: F64) -> F64:
     return out
 
 
-def verdict_of(change: Change, p: float | None, max_new: int) -> Verdict:
+def verdict_of(change: Change, max_new: int, noise: Noise | None) -> Verdict:
     """Decide about a metric on a suite.
 
     Args:
         change: What changed.
-        p: From `chances`; None where the policy is repeatable, so that nothing is chance.
         max_new: New events accepted.
+        noise: What drives show; None where the policy is repeatable, so that nothing is chance.
     """
     is_flag = change.metric.is_flag
-    if p is None:
-        is_worse = change.n_new > max_new if is_flag else change.is_beyond or change.n_far
-        return "worse" if is_worse else "non-inferior"
-    more = change.n_new - change.n_gone
-    if p <= EVENT_LEVEL and more > max_new if is_flag else p <= LEVEL:
+    if noise is None:
+        is_beyond = change.n_new > max_new if is_flag else change.is_beyond or change.n_far
+        return "worse" if is_beyond else "non-inferior"
+    if noise.is_worse:
         return "worse"
-    return "non-inferior" if is_within(change) and not change.n_far else "undecided"
+    return "non-inferior" if is_within(change) else "undecided"
 
 
 def is_within(change: Change) -> bool:
     """Tell whether a metric of a policy that is not repeatable is shown to be within its margin: a
-    distance by the sign-flip test against it, a rate by `rate_bound`.
+    distance by the mean of its cut cells and without a drive beyond the cut that none answers, an
+    event by the exact test of its rate.
     """
     if change.metric.is_flag:
         n = int(np.sum(change.is_pair))
-        return rate_bound(change.n_new, change.n_gone, n) < change.margin
-    rows = [np.where(change.is_pair, change.margin - harm, 0.0)[None] for harm in change.harms]
-    return all(flipped(row)[0] <= TAIL for row in rows)
-
-
-def rate_bound(new: float, gone: float, n: int) -> float:
-    """Return an upper bound of a rate's increase from new and gone events in n cells, by the bounds
-    of Clopper and Pearson, which also hold where scenes have other chances.
-
-    Example:
-        >>> round(rate_bound(0, 0, 36), 3)
-        0.097
-    """
-    return exact_rate(new, n)[1] - exact_rate(gone, n)[0] if n else 1.0
+        return chance_at_rate(change.n_new, change.n_gone, n, change.margin) <= TAIL
+    if not all(drives.is_answered for drives in change.far_drives):
+        return False
+    return all(chance_at_margin(harms, change.margin) <= TAIL for harms in change.of_cells)
 
 
 def seeds_that_decide(change: Change) -> int | None:
     """Return about how many seeds a scene would show that a metric is within its margin, if more of
-    them show the same; None where that is more than `MOST_SEEDS`.
+    them show the same; None where no number that can be asked for does.
     """
     n = int(np.sum(change.is_pair))
-    n_scenes = len(change.by_scene(change.now))
-    if n < 2:
+    n_scenes = len(change.by_scene(change.now)) if n else 0
+    if n == 0:
         return None
-    for seeds in range(1, MOST_SEEDS + 1):
-        cells = seeds * n_scenes
-        more = cells / n
-        if change.metric.is_flag:
-            is_shown = rate_bound(more * change.n_new, more * change.n_gone, cells) < change.margin
-        else:
-            error = float(np.std(change.harms[0][change.is_pair], ddof=1)) / math.sqrt(cells)
-            is_shown = abs(change.mean) + 2.0 * error < change.margin and 2.0**-cells <= TAIL
-        if is_shown:
-            return seeds
-    return None
+    if change.metric.is_flag:
+        return seeds_for_rate(change.n_new, change.n_gone, n, change.margin, n_scenes)
+    if not all(drives.is_answered for drives in change.far_drives):
+        return None
+    needed = [seeds_for_mean(harms, change.margin, n_scenes) for harms in change.of_cells]
+    known = [seeds for seeds in needed if seeds is not None]
+    return max(known) if len(known) == len(needed) else None

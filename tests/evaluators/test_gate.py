@@ -211,12 +211,30 @@ def often(share, key):
         (add(1.0, "offroad", slice(0, 6)), same, 6, 1),  # one scene alone takes six seeds
         (add(1.0, "offroad", slice(0, 5)), same, 5, 3),
         (both(often(0.0, 1), add(0.4)), often(0.0, 2), 2, 1),
-        (both(often(0.0, 1), add(4.0, where=slice(0, 1))), often(0.0, 2), 4, 3),
+        (both(often(0.0, 1), add(4.0, where=slice(0, 1))), often(0.0, 2), 4, 1),  # far beyond noise
+        (both(often(0.0, 1), add(0.5, where=slice(0, 1))), often(0.0, 2), 4, 3),  # or not so far
         (lambda run: often(0.0, 1)(run)[1:], same, 4, 2),
     ],
 )
 def test_a_policy_that_is_not_repeatable_is_tested_over_its_seeds(now, before, seeds, wanted):
     assert code(now, before, is_noisy=True, seeds=seeds) == wanted
+
+
+def test_a_gate_of_distances_says_what_it_bounds_and_what_lies_beyond():
+    verdict = judged([*rows("clean"), *often(0.0, 1)(rows())], gate(), repeatable=False)
+    text = next(check.text for check in verdict.checks if check.metric == "lateral_distance_m")
+    text = text.replace("\u00a0", " ")
+    assert "mean of drives cut at 0.3 m: " in text
+    assert "0 of 14 drives beyond 0.3 m: at most 19 %" in text
+
+
+def test_scenes_that_are_too_few_for_a_cut_mean_are_never_green():
+    """A rare far drive that was not drawn leaves every one of nine drives in its margin."""
+    noisy = [*rows("clean", scenes=3, seeds=3), *often(0.0, 1)(rows(scenes=3, seeds=3))]
+    spec = GateSpec(version=1, metrics={"lateral_distance_m": MetricRule(margin=0.1)})
+    verdict = judged(noisy, spec, repeatable=False)
+    assert verdict.exit_code == 3
+    assert verdict.checks[0].entry["seeds"] == 4
 
 
 def test_an_undecided_gate_says_how_many_seeds_would_decide():
