@@ -5,8 +5,30 @@ import ast
 from tests.source_modules import modules
 
 PRONOUNS = frozenset(
-    "one found shown known asked given own said seen drawn there here at of what where both mine "
-    "rest some every aside".split()
+    [
+        "one",
+        "found",
+        "shown",
+        "known",
+        "asked",
+        "given",
+        "own",
+        "said",
+        "seen",
+        "drawn",
+        "there",
+        "here",
+        "at",
+        "of",
+        "what",
+        "where",
+        "both",
+        "mine",
+        "rest",
+        "some",
+        "every",
+        "aside",
+    ]
 )
 # Share of all bindings that may still be pronouns: options of the contract (`--at`) and the
 # laboratory's oldest modules.
