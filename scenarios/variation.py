@@ -191,12 +191,12 @@ def _flat(part: Any, loc: tuple[str | int, ...]) -> JsonObject:
 def _paths_below(value: Any) -> Iterator[tuple[str | int, ...]]:
     """Yield the path of a plain value itself, and of everything inside it."""
     yield ()
-    inside = value.items() if isinstance(value, dict) else ()
-    if isinstance(value, list):
-        inside = [
-            (part.get("id", i) if isinstance(part, dict) else i, part)
-            for i, part in enumerate(value)
-        ]
+    inside: list[tuple[str | int, Any]] = []
+    if isinstance(value, dict):
+        inside = [*value.items()]
+    elif isinstance(value, list):
+        ids = [part.get("id", i) if isinstance(part, dict) else i for i, part in enumerate(value)]
+        inside = [*zip(ids, value, strict=True)]
     for key, part in inside:
         yield from ((key, *below) for below in _paths_below(part))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -58,6 +59,17 @@ def encoding_of(address: str, given: str) -> ImageEncoding:
     return cast("ImageEncoding", given)
 
 
+LOOPBACK = re.compile(r"(127\.[0-9.]+|localhost|\[::1\]):[0-9]+|unix:.*")
+
+
+def channel_options(target: str) -> list[tuple[str, int]]:
+    """Return the options of a channel: one to this machine goes through no proxy, whatever
+    ``http_proxy`` says.
+    """
+    is_here = LOOPBACK.fullmatch(target) is not None
+    return [*OPTIONS, *([("grpc.enable_http_proxy", 0)] if is_here else [])]
+
+
 class Service:
     """One service behind an address.
 
@@ -72,7 +84,7 @@ class Service:
 
     def __init__(self, name: str, target: str, error: type[SimrunError], retries: bool) -> None:
         self.name, self.target, self._error, self._retries = name, target, error, retries
-        self._channel = grpc.insecure_channel(target, options=OPTIONS)
+        self._channel = grpc.insecure_channel(target, options=channel_options(target))
         self.stub = Stub(self._channel, name)
 
     def wait_ready(self) -> None:

@@ -11,6 +11,7 @@ own runtime sends zeros until it hands over.
 
 import itertools
 import os
+import re
 import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -257,7 +258,12 @@ class AlpasimPolicy(DriverPolicy):
     @staticmethod
     def check_address(address: str) -> None:
         """Refuse what is no address, before a run begins."""
-        Address.parse("alpasim", address, OPTIONS)
+        place = Address.parse("alpasim", address, OPTIONS)
+        timeout = place.options.get("timeout_s", "300")
+        if not re.fullmatch(r"[0-9]+(\.[0-9]+)?", timeout):
+            raise InputError(
+                f"alpasim://{address}: timeout_s={timeout!r}", "write seconds as a number"
+            )
 
 
 def cameras_of(

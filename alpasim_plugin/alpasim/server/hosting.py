@@ -33,7 +33,6 @@ OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 RECEIVING = 128  # calls whose message is in memory and that are not worked on yet
-RECEIVED_BYTES = 16 << 20  # of one message: an image as JPEG or PNG, or a request to render
 SENDING_S = 30.0  # a caller that has not sent its message after so long is cancelled
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
@@ -388,7 +387,7 @@ class Host:
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
         # not retry. Calls wait instead.
         options = [
-            ("grpc.max_receive_message_length", RECEIVED_BYTES),
+            ("grpc.max_receive_message_length", MESSAGE_BYTES),
             ("grpc.max_send_message_length", MESSAGE_BYTES),
             ("grpc.so_reuseport", 0),
             ("grpc.max_concurrent_streams", STREAMS),
