@@ -53,6 +53,7 @@ OPENDRIVE = Fields(
         "OpenDRIVE": "junctionGroup station userData include",
         "header": """@revMajor @revMinor @name @version @date @north @south @east @west @vendor
             userData license defaultRegulations""",
+        "offset": "@x @y @z @hdg",
         "geometry": "userData",
         "road": "@name userData surface dataQuality",
         "type": "@type @country userData",
