@@ -37,6 +37,8 @@ WIDEST_OF_CUBE_RAD = np.deg2rad(110.0)  # of several planes
 BLEND = 0.02  # difference of the cosines to two pinholes' axes within which both are shown
 MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
+NEWTON_STEPS = 8
+LARGEST_STEP = 0.5  # of one step of Newton's method, at unit focal length
 CLOSE_PX = 0.05
 # weight of a reference's pixel that does not hold, where 255 is that of one that does
 NOT_HELD = np.float32(1)
@@ -536,26 +538,51 @@ def _opencv_reach(camera: CameraSpec) -> float:
     return 1.05 * float(np.linalg.norm(plane[converged], axis=1).max(initial=0.0))
 
 
-def _undistorted(given: F64, lens: LensModel, focal: tuple[float, float]) -> tuple[F64, Bool]:
-    """Invert `_distorted` by Newton's method with a numerical Jacobian, from the distorted points;
-    the flag says where that is right within `CLOSE_PX`.
+def _undistorted(distorted: F64, lens: LensModel, focal: tuple[float, float]) -> tuple[F64, Bool]:
+    """Invert `_distorted` by Newton's method, from the distorted points.
+
+    Args:
+        distorted: ``(N, 2)`` image points at unit focal length.
+        lens: The lens.
+        focal: Focal lengths along x and y, pixels.
+
+    Returns:
+        ``(N, 2)`` ideal image points, and a flag ``(N,)`` where they are right within `CLOSE_PX`.
     """
-    xy = given.copy()
-    h = 1e-6
+    xy = distorted.copy()
     with np.errstate(all="ignore"):
-        for _ in range(8):
-            at = _distorted(xy, lens)
-            (a, c), (b, d) = (
-                ((_distorted(xy + step, lens) - at) / h).T for step in ([h, 0.0], [0.0, h])
-            )
-            (p, q), det = (given - at).T, a * d - b * c
-            xy = xy + np.nan_to_num(
-                np.stack([d * p - b * q, a * q - c * p], axis=1) / det[:, None],
-                posinf=0.0,
-                neginf=0.0,
-            ).clip(-0.5, 0.5)
-        missed = np.linalg.norm((_distorted(xy, lens) - given) * focal, axis=1)
-    return xy, missed < CLOSE_PX
+        for _ in range(NEWTON_STEPS):
+            missing = distorted - _distorted(xy, lens)
+            step = _solved(_distortion_jacobian(xy, lens), missing)
+            xy = xy + step.clip(-LARGEST_STEP, LARGEST_STEP)
+        error_px = np.linalg.norm((_distorted(xy, lens) - distorted) * focal, axis=1)
+    return xy, error_px < CLOSE_PX
+
+
+def _distortion_jacobian(xy: F64, lens: LensModel) -> F64:
+    """Return the derivatives ``(N, 2, 2)`` of `_distorted` by forward differences: the rows are its
+    components, the columns x and y.
+    """
+    h = 1e-6
+    base = _distorted(xy, lens)
+    by_x = (_distorted(xy + np.array([h, 0.0]), lens) - base) / h
+    by_y = (_distorted(xy + np.array([0.0, h]), lens) - base) / h
+    return np.stack([by_x, by_y], axis=2)
+
+
+def _solved(matrix: F64, value: F64) -> F64:
+    """Solve ``matrix @ x = value`` for each of N systems of two equations by Cramer's rule.
+
+    A system without a solution gives 0, where `numpy.linalg.solve` would refuse them all.
+
+    Args:
+        matrix: ``(N, 2, 2)``.
+        value: ``(N, 2)``.
+    """
+    determinant = matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0]
+    x = (matrix[:, 1, 1] * value[:, 0] - matrix[:, 0, 1] * value[:, 1]) / determinant
+    y = (matrix[:, 0, 0] * value[:, 1] - matrix[:, 1, 0] * value[:, 0]) / determinant
+    return np.nan_to_num(np.stack([x, y], axis=1), posinf=0.0, neginf=0.0)
 
 
 def _covered(

@@ -142,53 +142,101 @@ class WeatherRenderer(Renderer):
         return self._read(frame, interpolate(log, within_us))
 
     def _read(self, frame: RecordedFrame, T_world_rig: F64) -> tuple[U8, F32]:
-        """Return an image in this weather, and its depth, with the ego at a pose ``(4, 4)``."""
+        """Return an image in this weather, and its depth, with the ego at a pose ``(4, 4)``.
+
+        Surfaces get their colours, then the light that falls on them, then what lies between them
+        and the camera, each effect on what the ones before it made.
+        """
         rgb, depth = frame.read()
-        environment = self.scenario.environment
-        sizes = {one.actor_id: one.box for one in self.scenario.actors}
-        boxes = [(T, sizes[name]) for name, T in frame.actors.items() if name in sizes]
-        view = view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground, boxes)
+        view = self._view(frame, depth)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
-        if environment.rain or environment.snow:
-            light += view.ground[..., None] * (wet_albedo(light) - light)
-        if self.snow:
-            light += self.snow.on(view)[..., None] * (ALBEDO - light)
-        illumination = self.light_rgb
-        if self.lights.is_night:
-            lamps = self.lights.lux(view, T_world_rig) / np.float32(WHITE_LUX)
-            compressed = (lamps / (1 + lamps / np.float32(BRIGHTEST)))[..., None]
-            illumination = (illumination + compressed * LAMP_RGB).astype(np.float32)
+        self._wet(light, view)
+        self._cover_with_snow(light, view)
+        illumination = self._illumination(view, T_world_rig)
         light *= illumination
-        if environment.rain:
-            flip = np.array([1.0, 1.0, -1.0])
-            below = [
-                replace(one, middle=one.middle * flip + [0, 0, 2 * T_world_rig[2, 3]])
-                for one in spots
-            ]
-            lamps, _ = drawn(below, view)
-            smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
-            share = view.ground * mirrored_share(-view.rays[..., 2])
-            light += share[..., None] * (self.air_rgb + smeared)
+        self._mirror_lamps(light, view, spots, T_world_rig)
         glow = _draw_lamps(light, view, [*self.lights.windows, *spots])
-        if self.extinction:
-            through = np.exp(-np.float32(self.extinction) * view.distance_m)[..., None]
-            light = light * through + self.air_rgb * (1 - through)
+        light = self._through_air(light, view)
         if self.lights.is_night:
             light += glow
-        if environment.time == "low_sun":
-            start = interpolate(self.scenario.ego_log, self.scenario.ego_log.t_us[0])
-            to_sun = start[:3, 0] + np.array([0, 0, SUN_TANGENT])
-            cosine = view.rays @ (to_sun / np.linalg.norm(to_sun)).astype(np.float32)
-            angle_deg = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1)
-            is_seen = np.isinf(view.distance_m) & (angle_deg == 1)
-            share = is_seen.sum() / max(np.sum(angle_deg == 1), 1)
-            light += np.float32(share * VEIL_DEG2) / angle_deg[..., None] ** 2
+        self._veil(light, view)
+        self._draw_falling(light, illumination, frame, depth.shape[:2])
+        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
+
+    def _view(self, frame: RecordedFrame, depth: F32) -> View:
+        """Return what stands where in an image, road users among it."""
+        boxes_by_id = {actor.actor_id: actor.box for actor in self.scenario.actors}
+        boxes = [
+            (T_world_box, boxes_by_id[actor_id])
+            for actor_id, T_world_box in frame.actors.items()
+            if actor_id in boxes_by_id
+        ]
+        return view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground, boxes)
+
+    def _wet(self, light: F32, view: View) -> None:
+        """Darken the ground where it is wet, in place."""
+        if self.scenario.environment.rain or self.scenario.environment.snow:
+            light += view.ground[..., None] * (wet_albedo(light) - light)
+
+    def _cover_with_snow(self, light: F32, view: View) -> None:
+        """Whiten what snow lies on, in place."""
+        if self.snow:
+            light += self.snow.on(view)[..., None] * (ALBEDO - light)
+
+    def _illumination(self, view: View, T_world_rig: F64) -> F32:
+        """Return the light on each pixel's surface, ``(3,)`` of the sky alone, ``(H, W, 3)`` where
+        lamps add to it; compressed so that near lamps do not saturate.
+        """
+        if not self.lights.is_night:
+            return self.light_rgb
+        lamps = self.lights.lux(view, T_world_rig) / np.float32(WHITE_LUX)
+        compressed = (lamps / (1 + lamps / np.float32(BRIGHTEST)))[..., None]
+        return (self.light_rgb + compressed * LAMP_RGB).astype(np.float32)
+
+    def _mirror_lamps(
+        self, light: F32, view: View, spots: Sequence[Spot], T_world_rig: F64
+    ) -> None:
+        """Mirror sky and lamps in a wet ground, smeared upright by its ripples, in place."""
+        if not self.scenario.environment.rain:
+            return
+        flip = np.array([1.0, 1.0, -1.0])
+        ground_twice = np.array([0.0, 0.0, 2 * T_world_rig[2, 3]])
+        below = [replace(spot, middle=spot.middle * flip + ground_twice) for spot in spots]
+        lamps, _ = drawn(below, view)
+        smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
+        share = view.ground * mirrored_share(-view.rays[..., 2])
+        light += share[..., None] * (self.air_rgb + smeared)
+
+    def _through_air(self, light: F32, view: View) -> F32:
+        """Return an image seen through fog, rain or snow, by Koschmieder's law."""
+        if not self.extinction:
+            return light
+        transmitted = np.exp(-np.float32(self.extinction) * view.distance_m)[..., None]
+        return light * transmitted + self.air_rgb * (1 - transmitted)
+
+    def _veil(self, light: F32, view: View) -> None:
+        """Add the glare of a low sun ahead of the recorded drive, as far as the sun is seen, in
+        place.
+        """
+        if self.scenario.environment.time != "low_sun":
+            return
+        start = interpolate(self.scenario.ego_log, self.scenario.ego_log.t_us[0])
+        to_sun = start[:3, 0] + np.array([0, 0, SUN_TANGENT])
+        cosine = view.rays @ (to_sun / np.linalg.norm(to_sun)).astype(np.float32)
+        angle_deg = np.maximum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1)
+        in_sun = angle_deg == 1
+        visible_share = (np.isinf(view.distance_m) & in_sun).sum() / max(in_sun.sum(), 1)
+        light += np.float32(visible_share * VEIL_DEG2) / angle_deg[..., None] ** 2
+
+    def _draw_falling(
+        self, light: F32, illumination: F32, frame: RecordedFrame, shape: tuple[int, int]
+    ) -> None:
+        """Draw drops and flakes, keyed by scene, seed, camera and time, in place."""
         for kind, rate in self.falling:
             key = (self.scenario.scene_id, self.seed, f"{kind.name}.{frame.camera}", frame.t_us)
-            covered = kind.covered(depth.shape, frame.K, rate, stream(*key))
+            covered = kind.covered(shape, frame.K, rate, stream(*key))
             light += covered[..., None] * (DAY_AIR_RGB * illumination - light)
-        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
 
 
 def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:

@@ -229,45 +229,64 @@ def make_actors(scenario: Scenario) -> Actors:
     return Actors(scenario.actors, scenario.vehicle, closed_us, scenario.lane_map, scenario.ground)
 
 
+@dataclass(frozen=True)
+class _TrackPiece:
+    """The piece of an actor's track that covers a time.
+
+    Attributes:
+        actor: Whose track it is.
+        t_us: The time on the actor's own clock: a walker's may run slower than the scene's.
+        begin, end: Indices of the poses before and after; equal in a track of one pose.
+        rate: Seconds of the actor's clock in a second of the scene; 0 for one that stands.
+    """
+
+    actor: Actor
+    t_us: int
+    begin: int
+    end: int
+    rate: float
+
+    @property
+    def span_us(self) -> int:
+        """Return the length of the piece, at least a microsecond."""
+        times = self.actor.track.t_us
+        return max(int(times[self.end] - times[self.begin]), 1)
+
+    @property
+    def share(self) -> float:
+        """Return how much of the piece has passed, 0 to 1."""
+        return (self.t_us - int(self.actor.track.t_us[self.begin])) / self.span_us
+
+
+def _track_piece(actor: Actor, scene_us: int, walker: Walker | None) -> _TrackPiece | None:
+    """Return the piece of a track at a time; None where the track does not cover it."""
+    track = actor.track
+    t_us = scene_us if walker is None else walker.own_us(scene_us)
+    if not track.t_us[0] <= t_us <= track.t_us[-1]:
+        return None
+    end = min(int(np.searchsorted(track.t_us, t_us, side="right")), len(track) - 1)
+    rate = float(not actor.is_static) if walker is None else walker.rate
+    return _TrackPiece(actor, t_us, max(end - 1, 0), end, rate)
+
+
 def _on_tracks(
     actors: Sequence[Actor], scene_us: int, walkers: Mapping[str, Walker]
 ) -> tuple[list[Actor], F64, F64]:
     """Return the actors whose track covers a time, their poses ``(N, 4, 4)`` there, and their
     velocities ``(N, 2)`` in the track's current piece; those that stand have none.
     """
-    times = [
-        walkers[actor.actor_id].own_us(scene_us) if actor.actor_id in walkers else scene_us
-        for actor in actors
-    ]
-    both = [
-        (actor, own_us)
-        for actor, own_us in zip(actors, times, strict=True)
-        if actor.track.t_us[0] <= own_us <= actor.track.t_us[-1]
-    ]
-    present = [actor for actor, _ in both]
-    if not present:
+    candidates = (_track_piece(actor, scene_us, walkers.get(actor.actor_id)) for actor in actors)
+    pieces = [piece for piece in candidates if piece is not None]
+    if not pieces:
         return [], np.zeros((0, 4, 4)), np.zeros((0, 2))
-    pieces = []
-    t_us = np.array([own_us for _, own_us in both])
-    for actor, own_us in both:
-        track = actor.track
-        after = min(int(np.searchsorted(track.t_us, own_us, side="right")), len(track) - 1)
-        pieces.append((track, max(after - 1, 0), after))
-    begin_us = np.array([track.t_us[i] for track, i, _ in pieces])
-    span_us = np.array([max(track.t_us[j] - track.t_us[i], 1) for track, i, j in pieces])
-    share = (t_us - begin_us) / span_us
-    xyz = np.array([track.xyz[i] for track, i, _ in pieces])
-    step = np.array([track.xyz[j] for track, _, j in pieces]) - xyz
-    begin = np.array([track.quat[i] for track, i, _ in pieces])
-    end = np.array([track.quat[j] for track, _, j in pieces])
-    poses = se3(xyz + share[:, None] * step, slerp(begin, end, share))
-    moving = np.array(
-        [
-            walkers[actor.actor_id].rate if actor.actor_id in walkers else not actor.is_static
-            for actor in present
-        ]
-    )
-    return present, poses, step[:, :2] * (moving * 1e6 / span_us)[:, None]
+    share = np.array([piece.share for piece in pieces])
+    xyz = np.array([piece.actor.track.xyz[piece.begin] for piece in pieces])
+    step = np.array([piece.actor.track.xyz[piece.end] for piece in pieces]) - xyz
+    quat_begin = np.array([piece.actor.track.quat[piece.begin] for piece in pieces])
+    quat_end = np.array([piece.actor.track.quat[piece.end] for piece in pieces])
+    poses = se3(xyz + share[:, None] * step, slerp(quat_begin, quat_end, share))
+    steps_per_s = np.array([piece.rate * 1e6 / piece.span_us for piece in pieces])
+    return [piece.actor for piece in pieces], poses, step[:, :2] * steps_per_s[:, None]
 
 
 @dataclass
