@@ -186,7 +186,6 @@ def _blend(
     zero = np.float32(0.0)
     largest = np.float32(LARGEST)
     nowhere = np.float32(NOWHERE)
-    level = np.float32(1.0 / HALF)
     half = np.float32(0.5 / HALF)
     y0, y1, fy = _between(height, scale, DETAIL * cells_down)
     x0, x1, fx = _between(width, scale, DETAIL * cells_across)
@@ -223,39 +222,8 @@ def _blend(
                     _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
             upper = offset_rows[k, v0[y] % 2]
             lower = offset_rows[k, v1[y] % 2]
-            for x in range(width):
-                px = np.float32(x) + upper[0, x] + fv[y] * (lower[0, x] - upper[0, x])
-                py = np.float32(y) + upper[1, x] + fv[y] * (lower[1, x] - upper[1, x])
-                px = min(max(px, zero), np.float32(width - 1))
-                py = min(max(py, zero), np.float32(height - 1))
-                left = np.int32(px)
-                top = np.int32(py)
-                a = px - np.float32(left)
-                g = py - np.float32(top)
-                shares[3, x] = g * a
-                shares[1, x] = a - shares[3, x]
-                shares[2, x] = g - shares[3, x]
-                shares[0, x] = one - a - shares[2, x]
-                to_right = min(left + 1, width - 1) - left
-                to_below = (min(top + 1, height - 1) - top) * width
-                first = top * width + left
-                place[0, x] = first
-                place[1, x] = first + to_right
-                place[2, x] = first + to_below
-                place[3, x] = first + to_right + to_below
-            image = references[k].reshape(-1)
-            for corner in range(4):
-                for x in range(width):
-                    corners[corner, x] = image[place[corner, x]]
-            for c in range(CHANNELS):
-                shift = np.uint32(8 * c)
-                for x in range(width):
-                    value = zero
-                    for corner in range(4):
-                        value += shares[corner, x] * np.float32(
-                            np.int32((corners[corner, x] >> shift) & np.uint32(255))
-                        )
-                    looked_up[c, x] = value
+            _place_row(upper, lower, fv[y], y, height, place, shares)
+            _sample_row(references[k].reshape(-1), place, shares, corners, looked_up)
             for row in (y0[y], y1[y]):
                 if row_of[k, 2 + row % 2] != row:
                     row_of[k, 2 + row % 2] = row
@@ -268,15 +236,91 @@ def _blend(
                 logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
                 share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
                 total[x] += share[x]
-            for c in range(3):
-                for x in range(width):
-                    correction_here = upper[c, x] + fy[y] * (lower[c, x] - upper[c, x])
-                    blended[c, x] += share[x] * (looked_up[c, x] * level - one + correction_here)
+            _add_row(upper, lower, fy[y], looked_up, share, blended)
         for x in range(width):
             over = one / total[x]
             for c in range(3):
                 out[i, x, c] = blended[c, x] * over
             recorded[i, x, 0] = max(one - over, zero)
+
+
+@vector_kernel
+def _place_row(upper, lower, share_down, y, height, place, shares):
+    """Find where a row of pixels looks a reference up: the four pixels around each place, and their
+    bilinear shares.
+
+    Args:
+        upper, lower: ``(2, W)`` offsets in pixels, across and down, of the coarser rows around.
+        share_down: The share of the lower one.
+        y, height: The row and the number of rows of the image.
+        place: ``(4, W)`` uint32, written: indices into the flat reference.
+        shares: ``(4, W)`` float32, written.
+    """
+    one = np.float32(1.0)
+    zero = np.float32(0.0)
+    width = place.shape[1]
+    for x in range(width):
+        px = np.float32(x) + upper[0, x] + share_down * (lower[0, x] - upper[0, x])
+        py = np.float32(y) + upper[1, x] + share_down * (lower[1, x] - upper[1, x])
+        px = min(max(px, zero), np.float32(width - 1))
+        py = min(max(py, zero), np.float32(height - 1))
+        left = np.int32(px)
+        top = np.int32(py)
+        to_right = px - np.float32(left)
+        to_below = py - np.float32(top)
+        shares[3, x] = to_below * to_right
+        shares[1, x] = to_right - shares[3, x]
+        shares[2, x] = to_below - shares[3, x]
+        shares[0, x] = one - to_right - shares[2, x]
+        next_column = min(left + 1, width - 1) - left
+        next_row = (min(top + 1, height - 1) - top) * width
+        first = top * width + left
+        place[0, x] = first
+        place[1, x] = first + next_column
+        place[2, x] = first + next_row
+        place[3, x] = first + next_column + next_row
+
+
+@vector_kernel
+def _sample_row(image, place, shares, corners, looked_up):
+    """Look a reference up at places found by `_place_row`, channel by channel.
+
+    Args:
+        image: ``(H W,)`` uint32, a pixel's four bytes in one number.
+        place, shares: ``(4, W)``.
+        corners: ``(4, W)`` uint32, scratch.
+        looked_up: ``(CHANNELS, W)`` float32, written: 0 to 255.
+    """
+    width = place.shape[1]
+    for corner in range(4):
+        for x in range(width):
+            corners[corner, x] = image[place[corner, x]]
+    for c in range(CHANNELS):
+        shift = np.uint32(8 * c)
+        for x in range(width):
+            value = np.float32(0.0)
+            for corner in range(4):
+                byte = np.int32((corners[corner, x] >> shift) & np.uint32(255))
+                value += shares[corner, x] * np.float32(byte)
+            looked_up[c, x] = value
+
+
+@vector_kernel
+def _add_row(upper, lower, share_down, looked_up, share, blended):
+    """Add a row of a reference, corrected and weighed, to what is blended.
+
+    Args:
+        upper, lower: ``(CHANNELS, W)`` corrections of the coarser rows around.
+        share_down: The share of the lower one.
+        looked_up: ``(CHANNELS, W)``, see `_sample_row`.
+        share: ``(W,)`` weight of the reference.
+        blended: ``(3, W)``, added to.
+    """
+    level = np.float32(1.0 / HALF)
+    for c in range(3):
+        for x in range(looked_up.shape[1]):
+            correction = upper[c, x] + share_down * (lower[c, x] - upper[c, x])
+            blended[c, x] += share[x] * (looked_up[c, x] * level - np.float32(1.0) + correction)
 
 
 @vector_kernel
