@@ -9,14 +9,21 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.limits import ROAD_M
-from alpasim_plugin.core.geometry import direction_of, heading_of, interpolate, rectangle_corners
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    direction_of,
+    heading_of,
+    interpolate,
+    rectangle_corners,
+)
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.path_end import PathTracker, remaining
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
 from alpasim_plugin.world.road_strip import Curve, Element, Intersection, LaneTaper, Profile
-from alpasim_plugin.world.roads import build_road
+from alpasim_plugin.world.roads import Road, build_road
 from scenarios.budget import ACTORS
-from scenarios.ego_path import make_ego_path
+from scenarios.ego_path import EgoPath, make_ego_path
 from scenarios.expert import drive
 from scenarios.recorded import RecordedLog
 from scenarios.schema import ScenarioSpec
@@ -38,6 +45,14 @@ STEP_US = 50_000
 SEAM_M = 1e-3  # lanes that share an edge are joined over rounding
 # scripts go on for so long after the end, so that the expert's lookahead does not see them stop
 TAIL_US = 4_000_000
+UNPOSTED = 1.5
+LEAST_MORE_M = 1.0
+JOINT_M, STRIP_M = (
+    2.0,
+    6.0,
+)  # where a straight behind the road begins to be free, and to either side
+STEP_M = 4.0  # what a fast car moves from one control step to the next
+TRACKED_EVERY = 20  # poses of the log
 
 
 def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
@@ -56,34 +71,23 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     ROAD_M.check(written_m, drawn.document.mark(("road", "segments")))
     n_actors = sum(getattr(actor, "count", 1) for actor in spec.actors)
     ACTORS.check(n_actors, drawn.document.mark(("actors",)))
-    with drawn.at("road", "segments"):
-        road = build_road(
-            elements(spec.road), profile(spec.road), (0.0, 0.0, np.deg2rad(spec.road.heading_deg))
-        )
-    with drawn.at("ego"):
-        ego_path = make_ego_path(road, spec.ego, spec.road.segments)
-    length_m = ego_path.path.length_m
-    if spec.ego.start_m >= length_m:
-        with drawn.at("ego", "start_m"):
-            raise _too_short(length_m, spec.ego.start_m)
     end_us = spec.built_until_us
+    road, ego_path, length_m = _long_enough(drawn, spec.road, vehicle)
     scripted, followers = place_actors(drawn, road, ego_path, vehicle, end_us + TAIL_US)
     ego_log, driven = drive(
         ego_path.path, spec.ego.start_m, vehicle, spec.ego, scripted, followers, end_us
     )
-    reached_us = int(ego_log.t_us[-1])
-    if reached_us < end_us:
-        reached_m, _ = ego_path.path.project(ego_log.xyz[-1:, :2])
-        with drawn.at("road", "segments"):
-            raise _too_short(
-                length_m,
-                float(reached_m[0]),
-                f" after {reached_us / 1e6:.1f} s of {end_us / 1e6:.1f} s",
-            )
+    _check_length(drawn, ego_path, ego_log, vehicle, length_m)
     actors = (*scripted, *driven)
     _check_drive(drawn, road.lane_map, ego_log, vehicle, actors)
     route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
     origin = (0.0, 0.0, 0.0)
+    notes = ()
+    if ego_path.path.length_m > length_m:
+        notes = (
+            f"the road goes on straight for {ego_path.path.length_m - length_m:.0f} m behind its "
+            f"last segment, as far as {fastest_mps(spec):.1f} m/s come in the time",
+        )
     return RecordedLog(
         drawn.scene_id,
         "yaml",
@@ -95,8 +99,111 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         (),
         origin,
         "",
+        notes,
         route=route,
+        path_beyond=before_end(
+            remaining(route.xyz, with_last(ego_log.xyz, TRACKED_EVERY)), vehicle
+        ),
+        path_end="road",
     )
+
+
+def fastest_mps(spec: ScenarioSpec) -> float:
+    """Return the speed of the fastest admissible drive on a built road: the posted limit, or
+    `UNPOSTED` times what the ego is told where none is posted, and no less than that.
+    """
+    assert spec.road is not None
+    told_mps = max(spec.ego.speed_mps, spec.ego.cruise_mps)
+    return max(spec.road.speed_limit_mps or UNPOSTED * told_mps, told_mps)
+
+
+def _long_enough(drawn: Drawn, spec: RoadSpec, vehicle: Vehicle) -> tuple[Road, EgoPath, float]:
+    """Build the road, with a straight behind its last segment where the fastest admissible drive
+    comes farther than that, and nothing else is in the way.
+
+    Returns:
+        The road, the ego's line on it, and the length of that line as written, metres.
+    """
+    ego = drawn.spec.ego
+    parts = elements(spec)
+    start = (0.0, 0.0, float(np.deg2rad(spec.heading_deg)))
+    with drawn.at("road", "segments"):
+        road = build_road(parts, profile(spec), start)
+    with drawn.at("ego"):
+        ego_path = make_ego_path(road, ego, spec.segments)
+    written_m = ego_path.path.length_m
+    if ego.start_m >= written_m:
+        with drawn.at("ego", "start_m"):
+            raise _too_short(written_m, ego.start_m)
+    front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+    reach_m = (
+        ego.start_m
+        + fastest_mps(drawn.spec) * drawn.spec.built_until_us * 1e-6
+        + 2 * front_m
+        + STEP_M
+    )
+    more_m = _free_ahead_m(road, ego_path, reach_m - written_m)
+    if more_m < LEAST_MORE_M:
+        return road, ego_path, written_m
+    with drawn.at("road", "segments"):
+        road = build_road([*parts, Curve(more_m)], profile(spec), start)
+    with drawn.at("ego"):
+        ego_path = make_ego_path(road, ego, spec.segments)
+    return road, ego_path, written_m
+
+
+def _free_ahead_m(road: Road, ego_path: EgoPath, more_m: float) -> float:
+    """Return how far a straight behind the road's end goes on, at most ``more_m``, before it meets
+    the road again.
+    """
+    if more_m < LEAST_MORE_M:
+        return 0.0
+    end, yaw = ego_path.path.at(ego_path.path.length_m)
+    forward = direction_of(float(yaw))
+    begin = end[:2] + JOINT_M * forward
+    axis = shapely.linestrings([begin, begin + more_m * forward])
+    strip = shapely.buffer(axis, STRIP_M, cap_style="flat")
+    lanes = shapely.union_all([lane_polygon(lane) for lane in road.lane_map.lanes.values()])
+    met = shapely.get_coordinates(shapely.intersection(strip, lanes))
+    if len(met) == 0:
+        return more_m
+    return float(np.min((met - begin) @ forward))
+
+
+def _check_length(
+    drawn: Drawn, ego_path: EgoPath, ego_log: Trajectory, vehicle: Vehicle, written_m: float
+) -> None:
+    """Check that the recorded drive stays on the road as it is written.
+
+    Raises:
+        InputError: It does not.
+    """
+    front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+    tracker = PathTracker(ego_path.path.xyz[::4])
+    end_us = drawn.spec.built_until_us
+    last_us = int(ego_log.t_us[-1])
+    for k in [*range(0, len(ego_log.t_us), TRACKED_EVERY), len(ego_log.t_us) - 1]:
+        s_m = tracker.follow(ego_log.xyz[k, :2])
+        t_us = int(ego_log.t_us[k])
+        if s_m + front_m + 1.0 > written_m or (t_us == last_us < end_us):
+            with drawn.at("road", "segments"):
+                raise _too_short(
+                    written_m, s_m, f" after {t_us / 1e6:.1f} s of {end_us / 1e6:.1f} s"
+                )
+
+
+def before_end(beyond: F64, vehicle: Vehicle) -> F64:
+    """Return a path ``(N, 3)`` of the rear axle up to where the front of the car comes to its end."""
+    if len(beyond) == 0:
+        return beyond
+    front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+    along_m = arc_lengths(beyond)
+    return beyond[along_m <= along_m[-1] - front_m - STEP_M]
+
+
+def with_last(points: F64, every: int) -> F64:
+    """Return every n-th of some points ``(N, D)``, and the last one."""
+    return points[[*range(0, len(points) - 1, every), len(points) - 1]]
 
 
 def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:

@@ -16,10 +16,11 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import content_of, file_sha256
 from alpasim_plugin.core.files.inputs import Inputs
-from alpasim_plugin.core.geometry import speeds
+from alpasim_plugin.core.geometry import arc_lengths, speeds
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.types import (
+    F64,
     Actor,
     BackgroundFile,
     Behaviour,
@@ -29,13 +30,14 @@ from alpasim_plugin.core.types import (
     Environment,
     Latency,
     Rates,
+    Route,
     Scenario,
     Vehicle,
 )
 from alpasim_plugin.world.markings import with_default_markings
-from alpasim_plugin.world.route import route_from_log
+from alpasim_plugin.world.route import EXTENSION_M, recorded_route
 from scenarios.budget import check_record, check_scenario
-from scenarios.build import built_drive
+from scenarios.build import UNPOSTED, before_end, built_drive
 from scenarios.cameras import camera_spec, check_mounts, given_cameras
 from scenarios.map_lines import alpasim_view
 from scenarios.recorded import RecordedLog
@@ -152,6 +154,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
         background is not None and not background.keep_road
     )
     lane_map = drive.lane_map if recorded else with_default_markings(drive.lane_map)
+    route, beyond = _route(drive, (end - start) * 1e-6)
     return Scenario(
         scene_id=_with_seed(drawn, scene_id),
         source=drive.source,
@@ -163,7 +166,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
             _vehicle(spec.vehicle) if spec.vehicle else drive.vehicle,
             friction=spec.environment.friction,
         ),
-        route=drive.route or route_from_log(drive.lane_map, drive.ego_log),
+        route=route,
         actors=_actors(drawn, drive),
         cameras=cameras,
         rates=Rates(**spec.rates.model_dump()),
@@ -183,8 +186,28 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
         recording=drive.recording,
         model=drive.model,
         standing=drive.standing,
+        path_beyond=beyond,
+        path_end="road" if drive.path_end == "record" and len(beyond) else drive.path_end,
         stop_at_path_end=timing.stop_at_path_end,
     )
+
+
+def _route(drive: RecordedLog, seconds: float) -> tuple[Route, F64]:
+    """Return where the ego should go, and the part of it behind the recorded drive ``(N, 3)`` on
+    which a rollout goes on: of a recorded log the lanes of its map, as far as the fastest
+    admissible drive comes. Where the street is recorded its images end with the drive.
+    """
+    nothing = np.zeros((0, 3))
+    if drive.route is not None:
+        return drive.route, nothing if drive.path_beyond is None else drive.path_beyond
+    limits = [lane.speed_limit_mps for lane in drive.lane_map.lanes.values()]
+    top_mps = float(np.max(speeds(drive.ego_log), initial=0.0))
+    fastest_mps = max([UNPOSTED * top_mps, *(limit for limit in limits if limit is not None)])
+    driven_m = float(arc_lengths(drive.ego_log.xyz)[-1])
+    more_m = max(EXTENSION_M, fastest_mps * seconds - driven_m)
+    route, ahead = recorded_route(drive.lane_map, drive.ego_log, more_m)
+    ends = drive.source in RECORDED_STREETS or drive.model is not None or bool(drive.recording)
+    return route, nothing if ends else before_end(ahead, drive.vehicle)
 
 
 def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:

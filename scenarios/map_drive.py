@@ -14,11 +14,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.path_end import remaining
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
+from scenarios.build import TRACKED_EVERY, with_last
 from scenarios.ego_path import grid
 from scenarios.expert import drive
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
@@ -126,6 +128,8 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         files.content_hash,
         (*_said(way, goal_m, heads, len(followers)), *gap_notes, *street.notes),
         route=Route(line.xyz[::4], way.lane_ids),
+        path_beyond=_up_to_goal(driven, driven.length_m - front_m - 1.0, ego_log.xyz),
+        path_end="goal",
     )
 
 
@@ -143,6 +147,12 @@ def _without_gaps(street: StreetMap) -> tuple[StreetMap, tuple[str, ...]]:
         for key, lane in street.lanes.items()
     }
     return replace(street, lanes=lanes), tuple(notes)
+
+
+def _up_to_goal(line: Path, goal_m: float, driven: F64) -> F64:
+    """Return the line ``(N, 3)`` of the rear axle between the end of a drive and the goal."""
+    stations = np.append(np.arange(0.0, goal_m, STATION_M / 2), goal_m)
+    return remaining(line.at(stations)[0], with_last(driven, TRACKED_EVERY))
 
 
 def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:

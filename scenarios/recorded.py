@@ -29,6 +29,7 @@ from alpasim_plugin.core.types import (
     CameraSpec,
     HeightField,
     LaneMap,
+    PathEndKind,
     Photograph,
     Route,
     Standing,
@@ -173,6 +174,8 @@ class RecordedLog:
     recording: tuple[Photograph, ...] = ()  # see `Scenario.recording`
     model: str | None = None  # see `Scenario.model`
     standing: Standing = "known"
+    path_beyond: F64 | None = None  # None: what the lanes of the map behind the drive say
+    path_end: PathEndKind = "record"
 
 
 def checked_trajectory(

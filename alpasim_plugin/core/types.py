@@ -490,6 +490,10 @@ class BackgroundFile:
 # What stands there: all of it among the actors, or found in a reconstruction.
 Standing = Literal["known", "found"]
 
+# What the end of a scene's path is: a place to arrive at, the end of the road that is known, or the
+# end of the recorded images and map, behind which nothing is known.
+PathEndKind = Literal["goal", "road", "record"]
+
 # ids of actors found in a reconstruction begin so: it shows them, nobody draws them once more
 STANDING_ID = "obstacle-"
 
@@ -506,6 +510,9 @@ class Scene:
         None  # the same road as AlpaSim's own loader reads it, where that differs
     )
     standing: Standing = "known"
+    # (N, 3) metres, world: the lane behind the recorded drive, as far as a rollout may go
+    path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    path_end: PathEndKind = "record"
 
 
 @dataclass(frozen=True)
@@ -551,9 +558,11 @@ class Scenario:
         None
     )
     standing: Standing = "known"
-    stop_at_path_end: bool = (
-        True  # a rollout ends where the recorded path does, unless the recorded car stands there
-    )
+    # (N, 3) metres, world: the lane behind the recorded drive, as far as the fastest admissible drive
+    # comes; empty where nothing is known there
+    path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    path_end: PathEndKind = "record"
+    stop_at_path_end: bool = True  # see `alpasim_plugin.core.path_end`
     # what the loader read beside the scenario file: path -> digest of the content
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -589,6 +598,8 @@ class Scenario:
             self.vehicle,
             self.alpasim_map,
             self.standing,
+            self.path_beyond,
+            self.path_end,
         )
 
 

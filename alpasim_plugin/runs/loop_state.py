@@ -1,5 +1,5 @@
-"""The state of one rollout between ticks: the ego and its history, the active plan, the end of the
-path, and a forecast from it.
+"""The state of one rollout between ticks: the ego and its history, the active plan, and a forecast
+from it.
 
 Predicted poses of cameras and road users are for `RenderRequest.ahead`. The controller moves the
 predicted ego along the active plan and along plans that become active after their latency. During
@@ -18,9 +18,7 @@ import numpy as np
 from alpasim_plugin.cameras.shutter import rolling_exposure
 from alpasim_plugin.control import Controller
 from alpasim_plugin.core.geometry import (
-    arc_lengths,
     interpolate,
-    project,
     quat_from_matrix,
     quat_from_yaw,
     wrap_angle,
@@ -46,10 +44,6 @@ from alpasim_plugin.runs.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig
-
-DIRECTION_M = 1.0
-STANDS_MPS = 1.0
-SPEED_SPAN_US = 500_000
 
 
 def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
@@ -109,47 +103,6 @@ class PlanQueue:
             self._active = self._pending[overtaking[-1]][1]
             del self._pending[: overtaking[-1] + 1]
         return self._active
-
-
-class PathEnd:
-    """Tells when the ego has passed the end of the recorded path.
-
-    Beyond that end nothing is known: no recorded drive to compare with, often no map. If the
-    recorded car stands there, what lies beyond is why it stopped (a queue, a red light), and
-    running into it must be seen: such a path has no end here.
-
-    Args:
-        log: The recorded rig poses.
-        stops: Whether a rollout ends there.
-
-    Attributes:
-        passed: Whether the ego has passed the end in this rollout.
-    """
-
-    def __init__(self, log: Trajectory, stops: bool = True) -> None:
-        self._path = log.xyz[:, :2]
-        self._length_m = float(arc_lengths(self._path)[-1])
-        before_us = max(int(log.t_us[-1]) - SPEED_SPAN_US, int(log.t_us[0]))
-        seconds = (int(log.t_us[-1]) - before_us) * 1e-6
-        there = interpolate(log, np.array([before_us]))[0, :2, 3]
-        goes = seconds > 0 and float(np.hypot(*(self._path[-1] - there))) / seconds > STANDS_MPS
-        self._has_end = goes and self._length_m > DIRECTION_M
-        s = arc_lengths(self._path)
-        inside = [
-            float(np.interp(self._length_m - DIRECTION_M, s, self._path[:, axis]))
-            for axis in (0, 1)
-        ]
-        self._ahead = self._path[-1] - np.array(inside)
-        self._stops = stops
-        self.passed = False
-
-    def ends_rollout(self, at: F64) -> bool:
-        """Note where the ego's rear axle is, ``(2,)``, metres, world; return whether the rollout
-        ends here.
-        """
-        if self._has_end and not self.passed and (at - self._path[-1]) @ self._ahead > 0.0:
-            self.passed = project(self._path, at)[0] >= self._length_m * (1 - 1e-12)
-        return self.passed and self._stops
 
 
 @dataclass

@@ -20,6 +20,7 @@ from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.path_end import PathEnd
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,
@@ -46,7 +47,6 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.film import Film
-from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
 NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
@@ -131,6 +131,7 @@ class Recorder:
         self._n_steps = 0
         self._first_call = 0
         self._passed = False
+        self._ended = "time"
         self._writer: AslWriter | None = None
 
     def __enter__(self) -> Recorder:
@@ -236,6 +237,7 @@ class Recorder:
     def finish(self, path_end: PathEnd) -> None:
         """Close the log and write the per-frame facts."""
         self._passed = path_end.passed
+        self._ended = path_end.kind if path_end.passed else "time"
         with self.stage("log"):
             self._log.finish()
             self._write_rows()
@@ -261,6 +263,7 @@ class Recorder:
             "steps": self._steps,
             "frame_events": dict(events),
             "passed_path_end": self._passed,
+            "ended": self._ended,
             "stage_ms": self._times.as_ms(),
             "session_uuid": self._session,
         }

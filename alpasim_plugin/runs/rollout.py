@@ -10,6 +10,7 @@ from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import PolicyError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer
 from alpasim_plugin.core.parts import complete
+from alpasim_plugin.core.path_end import PathEnd
 from alpasim_plugin.core.types import F64, Observation, Plan, Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig, make_cadence
 from alpasim_plugin.runs.guards import (
@@ -19,7 +20,7 @@ from alpasim_plugin.runs.guards import (
     checked_sensors,
     reset_policy,
 )
-from alpasim_plugin.runs.loop_state import Forecaster, LoopState, PathEnd, PlanQueue
+from alpasim_plugin.runs.loop_state import Forecaster, LoopState, PlanQueue
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.world.actors import make_actors
 
@@ -35,8 +36,8 @@ def run_rollout(
     """Drive one scenario once and return its recorder.
 
     Until ``start_us + warmup_us`` the logged ego pose is forced while renderer and policy run; then
-    the loop is closed. It ends at ``end_us``, or, if the scenario says so, where the ego passes the
-    end of the recorded path (`alpasim_plugin.runs.loop_state`).
+    the loop is closed. It ends at ``end_us``, or, unless the scenario says else, where the ego passes
+    the end of its path: a goal, or where the road ends (`alpasim_plugin.core.path_end`).
 
     Args:
         scenario: The scenario.
@@ -84,7 +85,7 @@ class Loop:
     Attributes:
         state: The ego and the newest frames.
         actors: Poses of the other road users at the present instant, by id.
-        path_end: Whether the end of the recorded path was passed.
+        path_end: Whether the end of the path was passed.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class Loop:
         self.state = LoopState.at_start(scenario, clock.n_steps)
         self.actors: Mapping[str, F64] = {}
         self._cadence = make_cadence(clock, scenario, sensors, self._renderer.block)
-        self.path_end = PathEnd(scenario.ego_log, scenario.stop_at_path_end)
+        self.path_end = PathEnd(scenario, scenario.stop_at_path_end)
         forecaster = Forecaster(scenario, controller, self._plans, self._world, self.state)
         self._rig = CameraRig(
             scenario,

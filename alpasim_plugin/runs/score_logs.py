@@ -17,6 +17,7 @@ from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, require_installed
+from alpasim_plugin.core.path_end import ends_with_path
 from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
@@ -24,7 +25,6 @@ from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
 from alpasim_plugin.runs.local_executor import apart
-from alpasim_plugin.runs.loop_state import PathEnd
 from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.scoring import tabulate
 from evaluators import score
@@ -164,7 +164,7 @@ def _score(
     if os.path.exists(log.parent / MANIFEST) and preset.image_camera not in cameras:
         preset = replace(preset, image_camera=None)  # our runs name their cameras as they like
     try:
-        check_complete(log, rollout)
+        check_complete(log, rollout, scene)
         parts = ", ".join(part.name for part in evaluators if part.is_users)
         if parts:
             work = partial(_values_of_log, preset=preset, evaluators=evaluators)
@@ -225,12 +225,12 @@ def check_vouched(log: Path) -> None:
         )
 
 
-def check_complete(log: Path, rollout: RolloutLog) -> None:
+def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
     """Refuse the log of a rollout that did not finish.
 
     A finished rollout has the number of control steps in its header after the first policy time, or
     covers the recording. A rollout that the driver terminated is finished, and one whose last pose
-    is the first beyond the end of the recorded path: ours end there.
+    is the first beyond the end of its path: ours end there.
 
     Raises:
         InfrastructureError: The log ends earlier.
@@ -240,7 +240,7 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
     recorded = (int(rollout.ego_log.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
     steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
     done = _steps(rollout)
-    if done < steps and not _ends_with_the_path(rollout):
+    if done < steps and not _ends_with_the_path(rollout, scene):
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
         raise InfrastructureError(
             f"{log}: the rollout ended after {done} of {steps} control steps{cut}",
@@ -248,11 +248,9 @@ def check_complete(log: Path, rollout: RolloutLog) -> None:
         )
 
 
-def _ends_with_the_path(rollout: RolloutLog) -> bool:
+def _ends_with_the_path(rollout: RolloutLog, scene: Scene) -> bool:
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    end = PathEnd(rollout.ego_log)
-    passed = [end.ends_rollout(at) for at in rig.xyz[1:, :2]]
-    return passed[-1] and not any(passed[:-1])
+    return ends_with_path(rig.xyz[1:, :2], scene)
 
 
 def _steps(rollout: RolloutLog) -> int:

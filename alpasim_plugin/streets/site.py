@@ -33,6 +33,7 @@ from alpasim_plugin.core.types import F32, F64, I64, Bool, Lane, Scenario
 HeightAt = Callable[[F64], F64]  # (N, 2+) world xy -> (N,) metres
 
 CELL_M = 0.25
+AHEAD_M = 40.0  # of the route behind the logged path
 REACH_M = 110.0  # how far from the path the rasters reach
 CLOSE_GAP_M = 1.5  # gaps between lanes narrower than twice this are road too
 SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
@@ -251,8 +252,8 @@ def section_of(point: I64) -> I64:
 
 
 def path_of(scenario: Scenario) -> F64:
-    """Return the logged path and 40 m of the route behind its end, ``(N, 3)`` world, one point a
-    metre.
+    """Return the logged path and the route behind its end, ``(N, 3)`` world, one point a metre:
+    40 m of it, and more where a rollout may go farther than the rasters would reach.
     """
     log = scenario.ego_log.xyz
     length = float(arc_lengths(log)[-1])
@@ -261,7 +262,11 @@ def path_of(scenario: Scenario) -> F64:
     if len(route) > 1:
         s = arc_lengths(route)
         end = np.argmin(np.sum((route[:, :2] - log[-1, :2]) ** 2, axis=1))
-        line = np.concatenate([log, route[(s > s[end] + 0.5) & (s < s[end] + 40.0)]])
+        more_m = AHEAD_M
+        if len(scenario.path_beyond) > 1:
+            beyond_m = float(arc_lengths(scenario.path_beyond)[-1])
+            more_m = max(more_m, beyond_m - REACH_M)
+        line = np.concatenate([log, route[(s > s[end] + 0.5) & (s < s[end] + more_m)]])
         length = float(arc_lengths(line)[-1])
     if length < 1.0:
         q = scenario.ego_log.quat[0]

@@ -175,7 +175,12 @@ HEADING_WEIGHT_M = 3.0
 def route_from_log(
     lane_map: LaneMap, ego_log: Trajectory, extension_m: float = EXTENSION_M
 ) -> Route:
-    """Make the route of a recorded drive.
+    """Make the route of a recorded drive; see `recorded_route`."""
+    return recorded_route(lane_map, ego_log, extension_m)[0]
+
+
+def recorded_route(lane_map: LaneMap, ego_log: Trajectory, extension_m: float) -> tuple[Route, F64]:
+    """Make the route of a recorded drive, and return it with its part behind the drive ``(N, 3)``.
 
     The polyline is the recorded path itself, thinned to `MIN_STEP_M`, so that following it
     reproduces the human; past its end it goes on along lane centres, at each fork with the smallest
@@ -200,20 +205,21 @@ def route_from_log(
         heading = _end_heading(driven, last=True)
     ids = match_lanes(index, driven, float(yaw_from_quat(ego_log.quat[0])))
     if not ids or extension_m <= 0:
-        return Route(driven, ids)
+        return Route(driven, ids), driven[:0]
     end = driven[-1]
     ahead = index.path_ahead(ids[-1], extension_m, start=end)
     if (
         len(ahead.xyz) < 2
         or abs(float(wrap_angle(index.heading_rad(ids[-1], end) - heading))) > MAX_HEADING_ERROR_RAD
     ):
-        return Route(driven, ids)
+        return Route(driven, ids), driven[:0]
     fade = np.clip(1 - arc_lengths(ahead.xyz) / BLEND_M, 0.0, 1.0)
     fade = fade * fade * (3 - 2 * fade)  # smooth at both ends
     tail = ahead.xyz + fade[:, None] * (end - ahead.xyz[0])
     if np.linalg.norm(driven[0] - driven[-1]) == 0 and len(driven) == 2:
         driven = driven[:1]
-    return Route(np.concatenate([driven, tail[1:]]), ids + ahead.lane_ids[1:])
+    route = Route(np.concatenate([driven, tail[1:]]), ids + ahead.lane_ids[1:])
+    return route, tail[1:]
 
 
 def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[str, ...]:

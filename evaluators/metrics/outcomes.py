@@ -15,13 +15,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, speeds
+from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, speeds
 from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.core.path_end import ends_with_path
 from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
+from evaluators.metrics.motion import time_to_collision_s
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.route import DIRECTION_M, followed, on_route, recorded_path, to_path
+from evaluators.metrics.route import (
+    BEHIND_END,
+    DIRECTION_M,
+    followed,
+    on_route,
+    recorded_path,
+    to_path,
+    way_beyond,
+)
 from evaluators.metrics.score import handover_us, series, with_preset
+from evaluators.metrics.scored import ScoredRollout
 from evaluators.metrics.table import LEFT_ROUTE_M, METRICS
 
 if TYPE_CHECKING:
@@ -55,6 +66,7 @@ OUTCOMES = {  # the gravest first
         Outcome("offroad", "off-road"),
         Outcome("wrong_lane", "wrong lane"),
         Outcome("left_route", "left the route"),
+        Outcome("ended_in_danger", "ended in danger", ("collision_at_fault", "collision_any")),
         Outcome("stalled", "stalled"),
         Outcome("braked_without_cause", "braked without cause", ("stalled",)),
     )
@@ -172,6 +184,14 @@ def ending_of(rollout: Rollout) -> str:
     return REACHED_END if reached_end(rollout) else SHORT_OF_END
 
 
+# what the manifest of a rollout calls its end, in words
+ENDED = {
+    "time": "its time was up",
+    "goal": "it came to its goal",
+    "road": "the known road ends there",
+    "record": "the recorded images and map end there",
+}
+DANGER_S = 2.0  # time to collision at the end of a rollout that its path ended
 STAND_MPS = 0.3
 STAND_S = 3.0
 SLOW_SHARE = 0.5
@@ -188,8 +208,8 @@ AFTER_S = 3.0  # what has been a cause excuses for so long
 
 
 def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
-    """Give ``stalled``, ``braked_without_cause`` and ``left_route`` per step; nothing by AlpaSim's
-    presets, whose metrics are AlpaSim's.
+    """Give ``stalled``, ``braked_without_cause``, ``left_route`` and ``ended_in_danger`` per step;
+    nothing by AlpaSim's presets, whose metrics are AlpaSim's.
     """
     if preset.aliases:
         return []
@@ -198,21 +218,36 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     path = recorded_path(rollout, preset)
     ego = ego_footprints(rollout, preset, origin)
     line = path.xyz[:, :2] - origin[:2]
-    lateral_m = on_route(line, path.t_us, t_us, ego.xy).lateral_m
+    on = on_route(line, path.t_us, t_us, ego.xy, way_beyond(rollout, scene, preset))
     s = followed(
         line,
         *to_path(line, ego.xy),
         ego.xy,
         float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
     )
-    has_side = np.isfinite(lateral_m)
+    has_side = np.isfinite(on.lateral_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, path, line, s)
+    is_measured = has_side & ~on.is_beyond
+    unknown = why if not has_side.all() else BEHIND_END
     return [
-        series("stalled", t_us, stalled, has_side, why),
-        series("braked_without_cause", t_us, braked, has_side, why),
-        series("left_route", t_us, np.nan_to_num(lateral_m) >= LEFT_ROUTE_M, has_side, why),
+        series("stalled", t_us, stalled, is_measured, unknown),
+        series("braked_without_cause", t_us, braked, is_measured, unknown),
+        series("left_route", t_us, np.nan_to_num(on.lateral_m) >= LEFT_ROUTE_M, has_side, why),
+        series("ended_in_danger", t_us, _in_danger(rollout, scene, preset)),
     ]
+
+
+def _in_danger(rollout: RolloutLog, scene: Scene, preset: Preset) -> Bool:
+    """Return ``(T,)`` whether the ego would touch a road user within `DANGER_S`: at the last step of
+    a rollout that its path ended, since nobody sees what comes then.
+    """
+    out = np.zeros(len(rollout.ego.t_us), np.bool_)
+    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    if ends_with_path(rig.xyz[1:, :2], scene):
+        drive = ScoredRollout(rollout, scene, preset, rollout.ego)
+        out[-1] = time_to_collision_s(drive.ego, drive.tracks)[-1] < DANGER_S
+    return out
 
 
 def _slow(

@@ -103,9 +103,11 @@ class Preset:
     stop_beyond_gt_m: float | None = (
         None  # rows after the first one this far from the recorded path are dropped
     )
+    # whether rows after the ego has come past the end of a recording that moves there are dropped
+    ends_with_recording: bool = False
     drop_black: bool = False  # a black image in a scored row removes the rollout
-    # The loop, not the scores: whether a rollout ends where the recorded path ends, if its scenario
-    # says so. AlpaSim drives on.
+    # The loop, not the scores: whether a rollout ends at the end of its path, if its scenario says
+    # so. AlpaSim drives on.
     stop_at_path_end: bool = True
 
     def __post_init__(self) -> None:
@@ -159,7 +161,7 @@ ALPASIM_LATER = replace(
 )
 
 PRESETS: dict[str, Preset] = {
-    "paper": Preset(name="paper", ego_size_m=(4.855, 1.88)),
+    "paper": Preset(name="paper", ego_size_m=(4.855, 1.88), ends_with_recording=True),
     ALPASIM.name: ALPASIM,
     ALPASIM_LATER.name: ALPASIM_LATER,
     "strict": Preset(

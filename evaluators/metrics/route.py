@@ -1,10 +1,12 @@
 """The drive against the recorded one: distance from its path, from its position at the time, and
 progress along it.
 
-Beyond the ends of that path the lateral distance is measured from its straight continuation:
-driving on is no error. Where the recorded car stands at an end, what its position does there is
-noise and no path. Progress moves along the path with the ego: where the path comes back beside
-itself, the nearest point of the whole path may be one that is still a long way ahead.
+Behind the end of that path the lateral distance is measured from the lane that the scene goes on
+along, and beyond that, as before the beginning, from a straight continuation: driving on is no
+error. The distance from a recording that moves at its end is not known there. Where the recorded
+car stands at an end, what its position does there is noise and no path. Progress moves along the
+path with the ego: where the path comes back beside itself, the nearest point of the whole path may
+be one that is still a long way ahead.
 
 The point compared is the ego's box centre; the recorded path is the recorded rig trajectory moved
 to the box centre with the log's rig-to-box pose. All distances are in plan view. The paper's route
@@ -16,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths, cross, interpolate, offset_trajectory
-from alpasim_plugin.core.types import F64, I64, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.geometry import arc_lengths, cross, interpolate, offset_trajectory, unit
+from alpasim_plugin.core.path_end import moves_at_end
+from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
 from evaluators.metrics.footprint import ego_footprints, held, origin_of
 from evaluators.metrics.presets import PRESETS, Preset
 from evaluators.metrics.score import relevant, series, with_preset
@@ -27,6 +30,7 @@ DIRECTION_M = 1.0
 # what a recording does within this distance of its first or last position is standing there
 STAND_M = 0.5
 SAME_M = 1e-6  # distances that differ by no more are equal
+BEHIND_END = "no recorded drive behind the end of the recording"
 FOUND_M = 2.0  # a path that was left is found again where it is this near
 
 
@@ -34,6 +38,18 @@ def recorded_path(rollout: RolloutLog, preset: Preset) -> Trajectory:
     """Return the recorded drive as poses of the box centre."""
     path = offset_trajectory(rollout.ego_log, rollout.T_rig_box)
     return replace(path, xyz=held(path.xyz, preset))
+
+
+def way_beyond(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> F64 | None:
+    """Return the lane behind the recorded drive as positions ``(M, 2)`` of the box centre, relative
+    to the origin; None where the scene has none.
+    """
+    if scene is None or len(scene.path_beyond) == 0:
+        return None
+    rig = np.concatenate([rollout.ego_log.xyz[-1:], scene.path_beyond])
+    forward = unit(np.diff(rig[:, :2], axis=0))
+    centres = rig[1:, :2] + rollout.T_rig_box[0, 3] * forward
+    return held(centres, preset) - origin_of(rollout.ego_log, preset)[:2]
 
 
 def to_path(path: F64, points: F64) -> tuple[F64, F64]:
@@ -207,27 +223,42 @@ class OnRoute:
         lateral_m: ``(T,)`` how far beside it, NaN where it has no direction; it goes straight on at
             both ends.
         side: ``(T,)`` as `left_of`.
+        is_beyond: ``(T,)`` whether a point is behind the far end of the path.
     """
 
     length_m: float
     along_m: F64
     lateral_m: F64
     side: F64
+    is_beyond: Bool
 
 
-def on_route(path: F64, recorded_us: I64, t_us: I64, points: F64) -> OnRoute:
+def on_route(
+    path: F64, recorded_us: I64, t_us: I64, points: F64, more: F64 | None = None
+) -> OnRoute:
     """Set points ``(T, 2)`` at times ``(T,)`` beside a recorded path ``(N, 2)`` with times
-    ``(N,)``.
+    ``(N,)``, and beside what it goes on along, ``(M, 2)``.
     """
     keep = moving(path)
-    line = path[keep]
-    along = arc_lengths(line)
+    recorded = path[keep]
+    along = arc_lengths(recorded)
+    length_m = float(along[-1])
+    line = recorded
+    if more is not None and len(more):
+        line = np.concatenate([recorded, more])
     distance_m, s = to_path(line, points)
     followed_m = followed(
         line, distance_m, s, points, float(np.interp(t_us[0], recorded_us[keep], along))
     )
+    at_end = followed_m >= length_m * (1 - 1e-12)
+    over_m = (points - recorded[-1]) @ (recorded[-1] - _at(recorded, along, length_m - DIRECTION_M))
+    is_beyond = (followed_m > length_m + STAND_M) | (at_end & (over_m > STAND_M * DIRECTION_M))
     return OnRoute(
-        float(along[-1]), followed_m, beside(line, s, points, distance_m), left_of(line, s, points)
+        length_m,
+        np.minimum(followed_m, length_m),
+        beside(line, s, points, distance_m),
+        left_of(line, s, points),
+        is_beyond,
     )
 
 
@@ -249,7 +280,11 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
         - origin[:2]
     )
     away_m = np.hypot(*(ego - recorded_xy).T)
-    on = None if preset.aliases else on_route(path, recorded.t_us, t_us, ego)
+    on = (
+        None
+        if preset.aliases
+        else on_route(path, recorded.t_us, t_us, ego, way_beyond(rollout, scene, preset))
+    )
     share, of_m = (s, length_m) if on is None else (on.along_m, on.length_m)
     share = share / of_m if of_m > 0 else np.full(len(s), np.nan)
     no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
@@ -257,6 +292,9 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     outside = "the recording does not cover this time"
     lateral_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
+    # A recording that stands at its end tells where to stop; one that goes on tells nothing more.
+    is_known = on is None or not moves_at_end(rollout.ego_log)
+    is_measured = np.ones(len(t_us), np.bool_) if is_known else ~on.is_beyond
     so_far = progress_so_far(recorded_xy, ego)
     driven_m = arc_lengths(ego)
     first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
@@ -275,7 +313,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
         ):
             column[:2] = 0.0
     out = [
-        series("dist_to_gt_trajectory", t_us, distance_m),
+        series("dist_to_gt_trajectory", t_us, distance_m, is_measured, BEHIND_END),
         series("dist_to_gt_location", t_us, away_m, covered, outside),
         series("progress", t_us, share, of_m > 0, no_length),
         series("progress_rel", t_us, so_far, covered, outside),
@@ -297,7 +335,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     return [
         *out,
         series("lateral_distance_m", t_us, on.lateral_m, has_side, no_direction),
-        series("route_distance_m", t_us, distance_m),
+        series("route_distance_m", t_us, distance_m, is_measured, BEHIND_END),
         series("lateral_bias_m", t_us, on.side * on.lateral_m, has_side, no_direction),
     ]
 

@@ -421,6 +421,13 @@ METRICS = MetricTable(
             invalid=_SHORT,
             formula="`lateral_distance_m` is 4 m or more",
         ),
+        "ended_in_danger": _flag(
+            "the path of the rollout ended less than 2 s before the ego would touch a road user",
+            label="rollouts that ended in danger",
+            reference=FOOTPRINT,
+            formula="1 at the last step where the ego has passed the end of its path (a goal, the end of the known road or of a recording) and "
+            "`time_to_collision_s` is below 2 s",
+        ),
         "stalled": _flag(
             "the ego stands although nothing is in its way and the recording drove on",
             label="stalled rollouts",

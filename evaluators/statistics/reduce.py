@@ -194,6 +194,11 @@ def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, L
         )
         if far.any():
             last_us = int(distance.t_us[np.argmax(far)])
+    if preset.ends_with_recording and "dist_to_gt_trajectory" in table:
+        distance = table["dist_to_gt_trajectory"]
+        behind = ~distance.valid & (distance.t_us >= first_us) & (distance.t_us <= last_us)
+        if behind.any():
+            last_us = int(distance.t_us[np.argmax(behind)])
     scored = int(np.sum((line >= first_us) & (line <= last_us)))
     return (
         first_us,

