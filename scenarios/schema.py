@@ -213,7 +213,7 @@ class TimingSpec(Part):
     )
     warmup_us: int = within(b.TIME_US, "How long the log is forced from then.", 500_000)
     stop_at_path_end: bool = field(
-        "End where the recorded path ends, unless the recorded car stands there.", True
+        "End at a goal, or where the known road or the recorded images end.", True
     )
     timeline: Literal["scenario", "alpasim"] = field(
         "alpasim: start at the recording's first camera frame and force 1.7 s.", "scenario"

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
 from alpasim_plugin.core.files.config import (
@@ -152,7 +154,8 @@ def _jitter(spec: ScenarioSpec, scene_id: str, fixed: Collection[str]) -> Scenar
             return part
         # One factor bends the whole road, so that transitions still end with the curvature of the
         # arc after them.
-        key = kind if kind == "curvature" else dotted(loc)
+        # An actor's speeds share one factor, so that who slows down still does.
+        key = kind if kind == "curvature" else dotted(loc).replace("end_speed_mps", "speed_mps")
         u = float(stream(scene_id, spec.seed, f"scenario/jitter/{key}").uniform(-1.0, 1.0))
         reach = u * getattr(spec.jitter, kind)
         if kind == "time_us":
@@ -160,7 +163,16 @@ def _jitter(spec: ScenarioSpec, scene_id: str, fixed: Collection[str]) -> Scenar
         return part + reach if kind == "position_m" else part * (1.0 + reach)
 
     update = {name: walk(getattr(spec, name), (name,)) for name in ("road", "ego", "actors")}
-    return spec.model_copy(update=update)
+    jittered = spec.model_copy(update=update)
+    try:
+        return ScenarioSpec.model_validate(jittered.model_dump(by_alias=True, exclude_unset=True))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(
+            f"{scene_id}, seed {spec.seed}: jitter makes {dotted(first['loc'])} = {first['input']}: "
+            f"{first['msg']}",
+            "lower a range of jitter, or move the number away from its bound",
+        ) from None
 
 
 def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[Any, Any]]:

@@ -118,7 +118,7 @@ def test_stepping_with_a_policys_plans_is_the_rollout_of_a_run():
     assert (Path(env._episode.folder.name) / LOG_NAME).read_bytes() == (
         recorder.folder / LOG_NAME
     ).read_bytes()  # type: ignore[union-attr]
-    assert info["ended"] == "path_end"
+    assert info["ended"] == "time"
     env.close()
 
 

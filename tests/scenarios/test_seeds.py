@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
 
 pytestmark = pytest.mark.slow
@@ -162,3 +163,34 @@ def test_adding_an_actor_does_not_change_the_others(tmp_path):
     )
     by_id = {a.actor_id: a for a in two.actors}
     assert one.actors[0].track.xyz.tobytes() == by_id["lead"].track.xyz.tobytes()
+
+
+def test_a_leader_that_brakes_a_little_never_speeds_up_by_jitter(tmp_path):
+    text = (
+        "version: 1\nroad: {segments: [{kind: straight, length_m: 240}]}\n"
+        "ego: {speed_mps: 12, cruise_mps: 12}\nactors:\n"
+        "  - {kind: hard_brake, id: leader, s_m: 28, speed_mps: 12, end_speed_mps: 11.5, "
+        "brake_at_us: 2500000}\ntiming: {duration_us: 2000000}\njitter: {speed: 0.2}\n"
+    )
+    (tmp_path / "gentle.yaml").write_text(text)
+    for seed in range(1, 5):
+        varied = load_scenario(tmp_path / "gentle.yaml", seed=seed).varied
+        speed_mps = varied["actors.leader.speed_mps"][1]
+        end_mps = varied["actors.leader.end_speed_mps"][1]
+        assert end_mps / speed_mps == pytest.approx(11.5 / 12)
+
+
+def refusal(path, seed):
+    """Return the message of the error with which a seed is refused; empty where it is not."""
+    try:
+        load_scenario(path, seed=seed)
+    except InputError as error:
+        return error.message
+    return ""
+
+
+def test_jitter_out_of_the_schema_is_refused(tmp_path):
+    near = BASE.replace("lane_width_m: 3.5", "lane_width_m: 2.21")
+    (tmp_path / "narrow.yaml").write_text(near + "jitter: {lane_width: 0.2}\n")
+    messages = [refusal(tmp_path / "narrow.yaml", seed) for seed in range(1, 9)]
+    assert any("jitter makes road.lane_width_m" in message for message in messages)
