@@ -82,7 +82,7 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     _check_drive(drawn, road.lane_map, ego_log, vehicle, actors)
     route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
     origin = (0.0, 0.0, 0.0)
-    notes = ()
+    notes: tuple[str, ...] = ()
     if ego_path.path.length_m > length_m:
         notes = (
             f"the road goes on straight for {ego_path.path.length_m - length_m:.0f} m behind its "
