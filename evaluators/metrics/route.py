@@ -293,8 +293,9 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     lateral_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
     # A recording that stands at its end tells where to stop; one that goes on tells nothing more.
-    is_known = on is None or not moves_at_end(rollout.ego_log)
-    is_measured = np.ones(len(t_us), np.bool_) if is_known else ~on.is_beyond
+    is_measured = np.ones(len(t_us), np.bool_)
+    if on is not None and moves_at_end(rollout.ego_log):
+        is_measured = ~on.is_beyond
     so_far = progress_so_far(recorded_xy, ego)
     driven_m = arc_lengths(ego)
     first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
