@@ -175,13 +175,14 @@ def _write_suites(path: Path, suites: Sequence[Suite]) -> Path:
     return path
 
 
-def rollout_suite(run: Run, outcomes_fail: bool = True) -> Suite:
+def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool = False) -> Suite:
     """Return one case for each rollout.
 
     Args:
         run: The run.
         outcomes_fail: A rollout with an outcome is a failed case; otherwise the outcome is a
             property of the case alone.
+        accepts_failures: A rollout that did not run to its end is skipped and no error.
     """
     asked = run.info.get("asked") or []  # what the command named, if that was one thing
     facts = {
@@ -193,13 +194,18 @@ def rollout_suite(run: Run, outcomes_fail: bool = True) -> Suite:
     with_values = len(run.rollouts) <= MAX_WITH_VALUES
     return Suite(
         str(asked[0]) if len(asked) == 1 else real(run.folder).name,
-        [_rollout_case(rollout, with_values, outcomes_fail) for rollout in run.rollouts],
+        [
+            _rollout_case(rollout, with_values, outcomes_fail, accepts_failures)
+            for rollout in run.rollouts
+        ],
         {key: value for key, value in facts.items() if value},
         str(run.info.get("started_at") or ""),
     )
 
 
-def _rollout_case(rollout: Rollout, with_values: bool, outcomes_fail: bool) -> Case:
+def _rollout_case(
+    rollout: Rollout, with_values: bool, outcomes_fail: bool, accepts_failures: bool
+) -> Case:
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
     time_s = rollout.wall_s or 0.0
     facts: dict[str, object] = {"path": rollout.path} if rollout.path else {}
@@ -207,7 +213,8 @@ def _rollout_case(rollout: Rollout, with_values: bool, outcomes_fail: bool) -> C
         kind = rollout.failure_class or "unknown"
         lines = [line for line in rollout.failure.splitlines() if line.strip()]
         message = lines[0] if lines else "no message was recorded"
-        return Case(rollout.scene, name, facts, time_s, "error", kind, message, rollout.failure)
+        result = "skipped" if accepts_failures else "error"
+        return Case(rollout.scene, name, facts, time_s, result, kind, message, rollout.failure)
     outcomes = outcomes_of(rollout)
     words = in_words(outcomes)
     facts["outcome"] = words
@@ -244,6 +251,11 @@ def check_suite(verdict: GateVerdict, gate: str) -> Suite:
                 text=check.text,
             )
         )
+    has_failed = any(case.result == "failure" for case in cases)
+    if verdict.exit_code != 0 and not has_failed:  # what decides is in no check
+        text = "; ".join(verdict.outcome.reasons)
+        cause = verdict.outcome.cause
+        cases.append(Case("gate", "verdict", {}, 0.0, "failure", cause, text, text))
     return Suite(f"gate {gate}", cases)
 
 
@@ -271,7 +283,8 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) ->
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text))
-    suites = [check_suite(verdict, gate), rollout_suite(run, outcomes_fail=False)]
+    rollouts = rollout_suite(run, outcomes_fail=False, accepts_failures=verdict.accepts_failures)
+    suites = [check_suite(verdict, gate), rollouts]
     tests = _write_suites(folder / "gate.junit.xml", suites)
     _append_job_summary(text)
     if real(folder) != real(run.folder):

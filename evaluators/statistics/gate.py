@@ -33,6 +33,7 @@ from evaluators.statistics.suite import (
     Noise,
     change_of,
     noises_of,
+    ran,
     seeds_that_decide,
     verdict_of,
 )
@@ -237,6 +238,7 @@ class GateVerdict:
     failures: JsonView
     baseline: str  # what was compared with, in words
     about: str  # what it is about, in words
+    accepts_failures: bool = False  # rollouts failed, and no more than the gate accepts
 
     @property
     def exit_code(self) -> int:
@@ -295,17 +297,21 @@ def check_gate(
         if owner == "the run" and (is_paired or not is_one_renderer):
             base = usual_base(variants)
     compares = is_paired or stored is not None or spec.baseline is not None
-    checks = []
-    for variant in _tested_variants(list(sides), spec, base, is_paired):
+    checks: list[Check] = []
+    partners: set[Variant] = set()
+    own_base = base if stored is None else None  # a stored one is in no variant's way
+    for variant in _tested_variants(list(sides), spec, own_base, is_paired):
         side = sides[variant]
+        name_in_text = variant.renderer if len(rollouts.policies) == 1 else variant.name
         if compares:
             other = _partner(variant, base, list(base_sides), owner)
+            partners.add(other)
             label = short_name(other, variant)
             other_side = as_policy(base_sides[other], variant.policy)
             against = label
             if stored is not None:
                 against += f" of {stored_name or 'the baseline'}"
-            pair = _Pair(variant, side, other_side, label, against)
+            pair = _Pair(variant, name_in_text, side, other_side, label, against)
             if spec.population == "scenes":
                 checks += _of_scenes(pair, spec, known)
             else:
@@ -314,16 +320,20 @@ def check_gate(
                 )
         for name, rule in spec.metrics.items():
             if rule.max is not None or rule.min is not None:
-                checks.append(_limit(side, variant, known.info(name), rule))
+                checks.append(_limit(side, variant, name_in_text, known.info(name), rule, spec))
     failures = failures_of(rollouts)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
-    outcomes.append(outcome_of_failures(failures, spec.max_failed))
+    of_failures = outcome_of_failures(failures, spec.max_failed)
+    outcomes.append(of_failures)
+    if stored is not None:
+        outcomes += _lost_variants(sides, base_sides, partners, spec)
     name = "limits alone" if stored is None else stored_name
     if base is not None and stored is None:
         kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
         name = f"{kind}{base.name} of the same run"
     about = SCENES if spec.population == "scenes" else SUITE[repeatable]
-    return GateVerdict(worst(outcomes), tuple(checks), failures, name, about)
+    accepts_failures = failures["n_failed"] > 0 and of_failures.cause == "pass"
+    return GateVerdict(worst(outcomes), tuple(checks), failures, name, about, accepts_failures)
 
 
 def _sides(table: RolloutTable) -> Sides:
@@ -363,6 +373,23 @@ def _tested_variants(
     return tested or variants  # a gate of limits alone needs no second variant
 
 
+def _lost_variants(
+    sides: Sides, base_sides: Sides, partners: set[Variant], spec: GateSpec
+) -> list[Outcome]:
+    """Return an incomplete outcome for each variant of a stored baseline that the run has lost.
+
+    Args:
+        sides, base_sides: Variants of the run and of the stored baseline.
+        partners: Variants of the baseline that one of the run is compared with.
+        spec: The gate; where it names renderers, others may be lost.
+    """
+    lost = [variant for variant in base_sides if variant not in sides and variant not in partners]
+    if spec.renderers:
+        lost = [variant for variant in lost if variant.renderer in spec.renderers]
+    text = "the stored baseline has it and the run does not: drive it, or write a new baseline"
+    return [Outcome("incomplete", (f"{variant.name}: {text}",)) for variant in lost]
+
+
 def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: str) -> Variant:
     """Return the variant that a variant is compared with; of a stored baseline of one other policy,
     that policy's.
@@ -384,9 +411,12 @@ def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: 
 
 @dataclass(frozen=True)
 class _Pair:
-    """A variant, its baseline, and what the baseline is called in entries and in sentences."""
+    """A variant with its name in sentences, its baseline, and what the baseline is called in entries
+    and in sentences.
+    """
 
     variant: Variant
+    name: str
     side: Side
     base: Side
     label: str
@@ -398,7 +428,7 @@ class _Pair:
         """Make the check of a metric."""
         renderer = self.variant.renderer
         policy = self.variant.policy
-        sentence = f"{renderer}: {metric.name} against {self.against}: {text}"
+        sentence = f"{self.name}: {metric.name} against {self.against}: {text}"
         return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
 
 
@@ -547,9 +577,26 @@ def _suite_check(
     return pair.check(metric, cause, text, entry, binding)
 
 
-def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -> Check:
+def _limit(
+    side: Side, variant: Variant, name: str, metric: MetricInfo, rule: MetricRule, spec: GateSpec
+) -> Check:
+    """Test the mean of a metric against its limits; a rollout that ran and has no value is missing,
+    as a pair is.
+
+    Args:
+        side: The rollouts.
+        variant: Whose they are.
+        name: Of the variant in the sentence.
+        metric: The metric.
+        rule: Its limits.
+        spec: What may be missing.
+    """
     values = side.values(metric.name)
-    known = values[np.isfinite(values)]
+    is_valid = np.isfinite(values)
+    known = values[is_valid]
+    n_ran = int(np.sum(ran(side)))
+    n_missing = int(np.sum(ran(side) & ~is_valid))
+    n_scenes = len(set(side.scene[is_valid].tolist()))
     mean = float(known.mean()) if len(known) else None
     cause: Cause = "incomplete"
     if mean is not None:
@@ -559,14 +606,21 @@ def _limit(side: Side, variant: Variant, metric: MetricInfo, rule: MetricRule) -
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(f"{kind} {end:g}" for kind, end in bounds.items() if end is not None)
     found = "no valid value" if mean is None else short(mean, metric.unit)
-    text = f"{variant.renderer}: {metric.name} {found}, limit {limits}"
-    worst = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
-    entry: JsonObject = {"mean": mean, **bounds, "n_rollouts": len(known)}
+    text = f"{name}: {metric.name} {found}, limit {limits}"
+    is_missing = n_missing > spec.max_missing * n_ran
+    if is_missing:
+        cause = "incomplete"
+        text += f"; valid in {len(known)} of {plural(n_ran, 'rollout')}"
+    if n_scenes < spec.min_scenes:
+        cause = "incomplete"
+        text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
+    worst_places = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
+    entry: JsonObject = {"mean": mean, **bounds, "n_rollouts": len(known), "n_missing": n_missing}
     entry["worst"] = [
         {"scene": side.cells[i][1], "seed": side.cells[i][2], "was": None, "now": values[i]}
-        for i in worst[:LISTED]
+        for i in worst_places[:LISTED]
     ]
-    binding = rule.must_decide or cause == "regression"
+    binding = rule.must_decide or is_missing or cause == "regression"
     return Check(
         variant.renderer, variant.policy, metric.name, "limit", cause, text, entry, binding
     )

@@ -162,8 +162,8 @@ def change_of(
     is_stopped = _any_of(side, stops)
     is_cut = is_shared & (is_stopped != was_stopped) & (not metric.is_flag)
     is_pair = pairs.both & ~is_cut
-    ran = _ran(side) & np.append(_ran(base), False)[pairs.index]
-    is_neither = ran & np.isnan(pairs.here) & np.isnan(pairs.there) & ~is_cut
+    is_run = ran(side) & np.append(ran(base), False)[pairs.index]
+    is_neither = is_run & np.isnan(pairs.here) & np.isnan(pairs.there) & ~is_cut
     lone = [side.cells[i] for i in np.flatnonzero(~(is_pair | is_cut | is_neither)).tolist()]
     lone += [base.cells[i] for i in pairs.only_base.tolist()]
     missing = [pairs.cause(cell, metric.name) for cell in lone]
@@ -188,7 +188,7 @@ def _any_of(side: Side, events: Sequence[str]) -> Bool:
     return np.any(np.array(values) > 0.0, axis=0)
 
 
-def _ran(side: Side) -> Bool:
+def ran(side: Side) -> Bool:
     """Tell of every cell ``(C,)`` whether all its rollouts ran to their end."""
     return np.bincount(side.cell, weights=~side.ok, minlength=len(side.cells)) == 0
 

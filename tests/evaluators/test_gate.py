@@ -184,6 +184,48 @@ def test_a_verdict_counts_and_names_what_changed():
     assert "1 new, 3 gone" in event.text
 
 
+LIMITS = GateSpec(version=1, metrics={"offroad": MetricRule(max=0.0)})
+
+
+@pytest.mark.parametrize(
+    ("fields", "wanted"),
+    [({}, 2), ({"max_missing": 0.8}, 2), ({"max_missing": 0.95}, 0), ({"min_scenes": 20}, 2)],
+)
+def test_a_limit_needs_the_values_and_the_scenes_that_a_margin_needs(fields, wanted):
+    spec = LIMITS.model_copy(update=fields)
+    run = rows() if "min_scenes" in fields else invalid("offroad", slice(1, None))(rows())
+    verdict = judged(run, spec)
+    assert verdict.exit_code == wanted
+    if not fields:
+        assert "valid in 1 of 14" in verdict.checks[0].text
+    assert judged(rows(), LIMITS).exit_code == 0
+
+
+def test_a_variant_that_the_stored_baseline_has_and_the_run_has_lost_is_incomplete():
+    stored = [*rows("clean"), *rows("3dgs")]
+    lost = judged(rows("clean"), gate(), stored, "before")
+    assert lost.exit_code == 2
+    assert "3dgs/p" in " ".join(lost.outcome.reasons)
+    assert judged(rows("clean"), gate(renderers=("clean",)), stored, "before").exit_code == 0
+    policies = [*rows("clean"), *rows("clean", policy="q")]
+    assert judged(rows("clean"), gate(), policies, "before").exit_code == 2
+    renamed = judged(rows("clean", policy="new"), gate(), rows("clean", policy="old"), "before")
+    assert renamed.exit_code == 0
+
+
+def test_with_a_stored_baseline_the_variant_that_a_gate_compares_with_is_tested_too():
+    run = [*add(1.0, "collision_at_fault")(rows("clean")), *rows("3dgs")]
+    verdict = judged(run, gate(baseline="clean"), rows("clean"), "before")
+    assert verdict.exit_code == 1
+    assert {check.renderer for check in verdict.checks} == {"clean", "3dgs"}
+
+
+def test_sentences_name_the_policy_where_there_are_several():
+    run = [*rows("clean"), *rows("clean", policy="q"), *rows("3dgs"), *rows("3dgs", policy="q")]
+    texts = [check.text for check in judged(run, gate()).checks]
+    assert any(text.startswith("3dgs/q: ") for text in texts)
+
+
 # --- policies that are not repeatable
 
 
@@ -339,6 +381,7 @@ def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
         "incomplete": 2,
         "policy": 2,
         "renderer": 2,
+        "fixer": 2,
         "undecided": 3,
         "infrastructure": 4,
         "evaluator": 5,
