@@ -18,6 +18,7 @@ from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import presets
 from evaluators.pages.terminal import render_presets
 from evaluators.statistics.opening import read_run
+from evaluators.statistics.verdicts import worst_code
 
 SHOWN_FAILURES = 5
 
@@ -82,7 +83,7 @@ def score(
                 ["simrun", *sys.argv[1:]],
                 lambda manifest: progress.rollout_done(manifest, reused=False),
             )
-    code = max(result.exit_code for result in results.values())
+    code = worst_code([result.exit_code for result in results.values()])
     documents = {name: result.as_dict() for name, result in results.items()}
     facts = {"exit_code": code, "presets": documents}
     if len(names) == 1:

@@ -103,9 +103,21 @@ def worst(outcomes: list[Outcome]) -> Outcome:
     return Outcome("pass")
 
 
+def worst_code(codes: Sequence[int]) -> int:
+    """Return the exit code that decides among several, in the order of causes.
+
+    Example:
+        >>> worst_code([3, 1, 0])
+        1
+    """
+    order = list(dict.fromkeys(EXIT_CODES[cause] for cause in SEVERITY))
+    return min(codes, key=order.index)
+
+
 # By failure class; that of any other class is the infrastructure.
 CAUSES: dict[str, Cause] = {
     "evaluator": "evaluator",
+    "input": "incomplete",
     "policy": "policy",
     "renderer fault": "renderer",
     "fixer fault": "fixer",
@@ -128,8 +140,6 @@ def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> 
     counts = ", ".join(f"{name} {count}" for name, count in by_class.items())
     text = f"{n_failed} of {n} rollouts could not be run or scored ({counts})"
     causes = {CAUSES.get(name, "infrastructure") for name in by_class}
-    if "infrastructure" in causes:
-        return Outcome("infrastructure", (text,))
     return Outcome(min(causes, key=SEVERITY.index), (text,))
 
 

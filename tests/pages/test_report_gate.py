@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from xml.etree import ElementTree
 
 import pyarrow.parquet as pq
 import pytest
@@ -13,8 +15,9 @@ from evaluators.pages.ci import write_gate_files
 from evaluators.pages.gate import gate_section, worst_of
 from evaluators.pages.overview import overview_of
 from evaluators.statistics.baselines import table_of_run
-from evaluators.statistics.gate import check_gate, load_gate
+from evaluators.statistics.gate import GateVerdict, check_gate, load_gate
 from evaluators.statistics.opening import read_run
+from evaluators.statistics.verdicts import outcome_of_failures
 
 
 def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usual_run, tmp_path):
@@ -48,6 +51,22 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usu
     table = pq.read_table(root / "rollouts.parquet")
     pq.write_table(table.slice(0, table.num_rows - 1), root / "rollouts.parquet")
     assert gate_section(read_run(root)) is None
+
+
+@pytest.mark.parametrize(("max_failed", "errors"), [(0.0, 1), (0.5, 0)])
+def test_junit_is_red_for_failed_rollouts_only_where_the_gate_is(
+    usual_run, tmp_path, max_failed, errors
+):
+    run = read_run(shutil.copytree(usual_run, tmp_path / "run"))
+    failed = replace(run.rollouts[0], status="failed", failure_class="renderer", failure="it fell")
+    run = replace(run, rollouts=[failed, *run.rollouts[1:]])
+    failures = {"n_failed": 1, "n_rollouts": len(run.rollouts), "by_class": {"renderer": 1}}
+    outcome = outcome_of_failures(failures, max_failed)
+    verdict = GateVerdict(outcome, (), failures, "before", "", accepts_failures=not errors)
+    file = write_gate_files(verdict, "gate", run, tmp_path / "files")[1]
+    root = ElementTree.parse(file).getroot()
+    assert (int(root.get("errors")), int(root.get("failures"))) == (errors, errors)
+    assert int(root.get("skipped")) == 1 - errors
 
 
 def test_what_breaks_a_rule_is_named_once_and_before_what_is_undecided():
