@@ -93,7 +93,7 @@ class Actors:
             driver.line = number
         paths = [driver.path for driver in self.drivers if driver.path is not None]
         self._lines = Lines(paths) if paths else None
-        self.replayed = [actor for actor in actors if actor.behaviour.kind not in DRIVING]
+        self.replayed = _Tracks([a for a in actors if a.behaviour.kind not in DRIVING])
         self.reset()
 
     def reset(self) -> None:
@@ -101,7 +101,7 @@ class Actors:
         self.t_us: int | None = None
         self.walkers = {
             actor.actor_id: Walker(actor)
-            for actor in self.replayed
+            for actor in self.replayed.actors
             if actor.behaviour.kind == "yield"
         }
         for driver in self.drivers:
@@ -117,7 +117,7 @@ class Actors:
         if self.t_us is not None and t_us > self.closed_us:
             for walker in self.walkers.values():
                 walker.step(max(self.t_us, self.closed_us), t_us, ego, self.vehicle)
-        replayed, poses, velocity = _on_tracks(self.replayed, t_us, self.walkers)
+        replayed, poses, velocity = self.replayed.at(t_us, self.walkers)
         out = {actor.actor_id: pose for actor, pose in zip(replayed, poses, strict=True)}
         if self._lines is not None and self.t_us is not None and t_us > self.closed_us:
             bodies = bodies_from(
@@ -149,9 +149,7 @@ class Actors:
             (d, None if d.motion is None else replace(d.motion)) for d in self.drivers if d.present
         ]
         walkers = {key: replace(walker) for key, walker in self.walkers.items()}
-        return ActorForecast(
-            tuple(self.replayed), walkers, tuple(reactive), self.t_us, self.closed_us
-        )
+        return ActorForecast(self.replayed, walkers, tuple(reactive), self.t_us, self.closed_us)
 
     def _advance(self, lines: Lines, from_us: int, to_us: int, others: Bodies) -> None:
         """Move all reactive drivers, who see each other and the others' bodies."""
@@ -195,7 +193,7 @@ class ActorForecast:
     along their line.
     """
 
-    replayed: tuple[Actor, ...]
+    replayed: _Tracks
     walkers: Mapping[str, Walker]
     reactive: tuple[tuple[_Driver, _Motion | None], ...]
     t_us: int | None
@@ -209,7 +207,7 @@ class ActorForecast:
             key: replace(w, lag_us=w.lag_us + (1.0 - w.rate) * (t_us - (self.t_us or t_us)))
             for key, w in self.walkers.items()
         }
-        replayed, poses, _ = _on_tracks(self.replayed, t_us, waiting)
+        replayed, poses, _ = self.replayed.at(t_us, waiting)
         out = {actor.actor_id: pose for actor, pose in zip(replayed, poses, strict=True)}
         for driver, motion in self.reactive:
             if motion is None:
@@ -269,24 +267,43 @@ def _track_piece(actor: Actor, scene_us: int, walker: Walker | None) -> _TrackPi
     return _TrackPiece(actor, t_us, max(end - 1, 0), end, rate)
 
 
-def _on_tracks(
-    actors: Sequence[Actor], scene_us: int, walkers: Mapping[str, Walker]
-) -> tuple[list[Actor], F64, F64]:
-    """Return the actors whose track covers a time, their poses ``(N, 4, 4)`` there, and their
-    velocities ``(N, 2)`` in the track's current piece; those that stand have none.
+class _Tracks:
+    """Actors that follow their tracks, with an index of when each track begins and ends.
+
+    A step looks only at tracks that cover it: in a town most road users come and go. Walkers have
+    clocks of their own and are always looked at.
     """
-    candidates = (_track_piece(actor, scene_us, walkers.get(actor.actor_id)) for actor in actors)
-    pieces = [piece for piece in candidates if piece is not None]
-    if not pieces:
-        return [], np.zeros((0, 4, 4)), np.zeros((0, 2))
-    share = np.array([piece.share for piece in pieces])
-    xyz = np.array([piece.actor.track.xyz[piece.begin] for piece in pieces])
-    step = np.array([piece.actor.track.xyz[piece.end] for piece in pieces]) - xyz
-    quat_begin = np.array([piece.actor.track.quat[piece.begin] for piece in pieces])
-    quat_end = np.array([piece.actor.track.quat[piece.end] for piece in pieces])
-    poses = se3(xyz + share[:, None] * step, slerp(quat_begin, quat_end, share))
-    steps_per_s = np.array([piece.rate * 1e6 / piece.span_us for piece in pieces])
-    return [piece.actor for piece in pieces], poses, step[:, :2] * steps_per_s[:, None]
+
+    def __init__(self, actors: Sequence[Actor]) -> None:
+        self.actors = tuple(actors)
+        self.first_us = np.array([actor.track.t_us[0] for actor in actors], dtype=np.int64)
+        self.last_us = np.array([actor.track.t_us[-1] for actor in actors], dtype=np.int64)
+        self.yields = np.array(
+            [actor.behaviour.kind == "yield" for actor in actors], dtype=np.bool_
+        )
+
+    def at(self, scene_us: int, walkers: Mapping[str, Walker]) -> tuple[list[Actor], F64, F64]:
+        """Return the actors whose track covers a time, their poses ``(N, 4, 4)`` there, and their
+        velocities ``(N, 2)`` in the track's current piece; those that stand have none.
+        """
+        covers = (self.first_us <= scene_us) & (scene_us <= self.last_us)
+        pieces = []
+        for index in np.flatnonzero(covers | self.yields):
+            actor = self.actors[index]
+            piece = _track_piece(actor, scene_us, walkers.get(actor.actor_id))
+            if piece is not None:
+                pieces.append(piece)
+        if not pieces:
+            return [], np.zeros((0, 4, 4)), np.zeros((0, 2))
+        share = np.array([piece.share for piece in pieces])
+        xyz = np.array([piece.actor.track.xyz[piece.begin] for piece in pieces])
+        step = np.array([piece.actor.track.xyz[piece.end] for piece in pieces]) - xyz
+        quat_begin = np.array([piece.actor.track.quat[piece.begin] for piece in pieces])
+        quat_end = np.array([piece.actor.track.quat[piece.end] for piece in pieces])
+        poses = se3(xyz + share[:, None] * step, slerp(quat_begin, quat_end, share))
+        steps_per_s = np.array([piece.rate * 1e6 / piece.span_us for piece in pieces])
+        velocity_mps = step[:, :2] * steps_per_s[:, None]
+        return [piece.actor for piece in pieces], poses, velocity_mps
 
 
 @dataclass
