@@ -8,7 +8,7 @@ worse. Three things are told apart, each with an error of its own:
   at `CUT_MARGINS` margins. No sample bounds the mean of what is not cut: one drive in forty that
   leaves the road by four metres moves it by 0.1 m, and 14 drives show none of them in 70 % of runs.
 - **Drives beyond the cut** are an event. One is red if the rest of the run is quiet: no other harm or
-  gain is larger than one margin, or than a fifth of it. Otherwise the policy's own noise may be the
+  gain is larger than an eighth of it. Otherwise the policy's own noise may be the
   cause; one that no gain answers then keeps the gate from being green, and the exact sign test of
   harms and gains beyond the cut makes it red. The rate that the drives leave open is printed.
 - **Events** are compared by their exact test.
@@ -84,8 +84,7 @@ class Beyond:
         n_worse: Cells that are worse by more than `CUT_MARGINS` margins.
         n_better: Cells that are better by more.
         n: All cells.
-        is_quiet: No other cell is worse or better by more than one margin, or than the worst one
-            divided by `APART`.
+        is_quiet: No other cell is worse or better by more than the worst one divided by `APART`.
     """
 
     n_worse: int
@@ -125,7 +124,7 @@ def beyond(harms: F64, margin: float, rounding: float = 0.0) -> Beyond:
     most = CUT_MARGINS * margin + rounding
     is_worse = harms > most
     others = np.abs(harms[~is_worse])
-    largest = max(margin + rounding, float(np.max(harms, initial=0.0)) / APART)
+    largest = float(np.max(harms, initial=0.0)) / APART
     is_quiet = bool((others <= largest).all())
     return Beyond(int(np.sum(is_worse)), int(np.sum(harms < -most)), len(harms), is_quiet)
 
@@ -184,7 +183,7 @@ def chance_at_rate(new: int, gone: int, n: int, margin: float) -> float:
 
     Example:
         >>> round(chance_at_rate(0, 0, 36, 0.1), 4)  # 0.9^36 = 0.0225 where nothing may be gone
-        0.0232
+        0.0241
     """
     if n == 0 or margin <= 0.0 or margin >= 1.0:
         return float(margin < 1.0)
