@@ -46,10 +46,17 @@ STAGES = {
     A + "log": (A + "log.wire",),
     RUN_FOLDER: LOG,
     A + "alpasim.client": (A + "world", A + "control", *LOG),  # parts that are a service's
+    "evaluators.results": (),
     "evaluators.metrics": (RUN_FOLDER,),
-    "evaluators.statistics": (RUN_FOLDER, "evaluators.metrics"),
+    "evaluators.statistics": (RUN_FOLDER, "evaluators.results", "evaluators.metrics"),
     "evaluators.alpasim": ("evaluators.metrics", "evaluators.statistics"),
-    "evaluators.pages": (*LOG, RUN_FOLDER, "evaluators.metrics", "evaluators.statistics"),
+    "evaluators.pages": (
+        *LOG,
+        RUN_FOLDER,
+        "evaluators.results",
+        "evaluators.metrics",
+        "evaluators.statistics",
+    ),
 }
 # The public face of the evaluators: it imports names of its folders, and holds nothing else.
 FACES = ("evaluators",)

@@ -1,8 +1,8 @@
 """``simrun compare``: means and paired differences within a run, between two runs, or over shards."""
 
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import Annotated, Any
@@ -11,7 +11,7 @@ from alpasim_plugin.cli.options import Json, run_or_newest
 from alpasim_plugin.cli.output import first_screen, show, terminal_width, warn
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.flags import Flag, Positional
-from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
@@ -19,12 +19,14 @@ from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.pages.tables import PairRow, pair_rows
 from evaluators.pages.terminal import metric_lines
+from evaluators.results import Censoring, Difference, Mean, Summary, to_json
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run, read_run
 from evaluators.statistics.outcomes import LISTED, outcome_table
-from evaluators.statistics.summary import CUT_RULES
+from evaluators.statistics.paired import BLOCKS
+from evaluators.statistics.summary import joined_censoring
 
 EPILOG = """
 Examples:
@@ -42,6 +44,7 @@ Examples:
 EVERY_MISSING = 10**9
 INDENT = " " * 6  # of what does not fit on a line
 SHOWN = 10  # lines about missing pairs
+NONE_SHOWN = "none shown"
 
 
 def compare(
@@ -74,52 +77,52 @@ def compare(
     elif len(folders) > 1:
         joined = aggregate_runs(folders, baseline)
         result = Comparison(
-            joined["paired"],
-            with_base=joined["paired_with_base"],
+            joined.paired,
+            joined.paired_with_base,
+            joined.paired_policies,
             metrics=joined_metrics(folders),
-            policies=joined["paired_policies"],
         )
-        means = joined
         whole = [rollout for run in opened for rollout in run.rollouts]
         asked = list(dict.fromkeys(name for run in opened for name in run.info.get("asked") or ()))
         info = {**opened[0].info, "asked": asked}
         info["scenes"] = {
             name: facts for run in opened for name, facts in run.info["scenes"].items()
         }
-        summary = joined | _endings(opened, whole, joined["metrics"])
-        shown = replace(opened[0], summary=summary, rollouts=whole, info=info)
+        means = _with_endings(joined, opened, whole)
+        shown = replace(opened[0], summary=means, rollouts=whole, info=info)
     else:
         result = compare_within(opened[0], baseline, EVERY_MISSING)
-        means = dict(opened[0].summary)
+        means = opened[0].summary
         shown = opened[0]
     facts: dict[str, Any] = {
         "runs": [str(run) for run in folders],
         "notes": list(result.notes),
-        "paired": result.paired,
-        "paired_with_base": result.with_base,
-        "paired_policies": result.policies,
+        **{block: _tables_as_json(getattr(result, block)) for block in BLOCKS},
     }
     lines = []
     if means is not None:
-        facts |= {name: means[name] for name in ("preset", "metrics", "failures")}
+        facts |= {
+            "preset": means.preset,
+            "metrics": _tables_as_json(means.metrics),
+            "failures": to_json(means.failures),
+        }
         lines += first_screen(shown)
         if every:
             lines += metric_lines(means, known=result.metrics)
-        failures = means["failures"]
-        if failures["n_failed"]:
-            causes = ", ".join(f"{name} {count}" for name, count in failures["by_class"].items())
-            number = f"{failures['n_failed']} of {failures['n_rollouts']}"
+        failures = means.failures
+        if failures.n_failed:
+            causes = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())
+            number = f"{failures.n_failed} of {failures.n_rollouts}"
             lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
     said = [f"note: {note}" for note in result.notes]
-    for tables in (result.paired, result.with_base, result.policies):
+    for tables in (result.paired, result.paired_with_base, result.paired_policies):
         for variant, entries in tables.items():
-            baseline = next((entry["baseline"] for entry in entries.values()), "nothing")
+            baseline = next((entry.baseline for entry in entries.values()), "nothing")
             said += ["", f"{variant} minus {baseline}"]
             rows = [
                 row
-                for row in pair_rows({"paired": {variant: entries}}, result.metrics)
-                if entries[row.metric]["n_cells"]
-                and (every or row.metric in result.metrics.headline)
+                for row in pair_rows([(variant, entries)], result.metrics)
+                if entries[row.metric].n_cells and (every or row.metric in result.metrics.headline)
             ]
             said += _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
             missing = _missing(entries, len(entries) if every else SHOWN)
@@ -132,43 +135,50 @@ def compare(
     show(as_json, facts, *lines)
 
 
-def _endings(
-    runs: Sequence[Run], rollouts: Sequence[Rollout], keys: Collection[str]
-) -> dict[str, Any]:
-    """Return how the rollouts of some runs ended, with the times of their events, and how many of
-    their steps were cut; ``keys`` are those of the joined summary.
+def _tables_as_json(tables: Mapping[str, Mapping[str, Mean | Difference]]) -> JsonObject:
+    return {
+        variant: {metric: to_json(entry) for metric, entry in entries.items()}
+        for variant, entries in tables.items()
+    }
+
+
+def _with_endings(joined: Summary, runs: Sequence[Run], rollouts: Sequence[Rollout]) -> Summary:
+    """Return the joined summary of some runs with how their rollouts ended, the times of their
+    events, and what their own summaries say was removed.
     """
-    tables = [run.summary.get("outcomes") or outcome_table(run.rollouts) for run in runs]
     outcomes = outcome_table(rollouts)
-    for variant, entry in outcomes.items():
-        for name, facts in entry["outcomes"].items():
-            parts = [table[variant]["outcomes"] for table in tables if variant in table]
-            cells = [cell for part in parts if name in part for cell in part[name]["cells"]]
-            facts["cells"] = cells[:LISTED]
-    cut: dict[str, Counter[str]] = {}
+    for variant, endings in outcomes.items():
+        own = [run.summary.outcomes[variant] for run in runs if variant in run.summary.outcomes]
+        counts = {}
+        for name, events in endings.outcomes.items():
+            parts = [part.outcomes[name].cells for part in own if name in part.outcomes]
+            counts[name] = replace(events, cells=tuple(chain(*parts))[:LISTED])
+        outcomes[variant] = replace(endings, outcomes=counts)
+    ledgers: dict[str, list[Censoring]] = {}
     for run in runs:
-        for renderer, entry in (run.summary.get("censoring") or {}).items():
-            key = renderer if renderer in keys else cell_name(renderer, run.policies[0])
-            cut.setdefault(key, Counter()).update(
-                {rule: entry.get(rule) or 0 for rule in CUT_RULES}
-            )
-    return {"outcomes": outcomes, "censoring": cut}
+        for renderer, ledger in run.summary.censoring.items():
+            is_key = renderer in joined.metrics
+            key = renderer if is_key else cell_name(renderer, run.policies[0])
+            ledgers.setdefault(key, []).append(ledger)
+    censoring = {key: joined_censoring(parts) for key, parts in ledgers.items()}
+    return replace(joined, outcomes=outcomes, censoring=censoring)
 
 
 def _table(
-    rows: Sequence[PairRow], entries: Mapping[str, JsonView], known: MetricTable
+    rows: Sequence[PairRow], entries: Mapping[str, Difference], known: MetricTable
 ) -> list[str]:
     """Return one line per metric."""
     lines = [("metric", "difference", "p", "these scenes", "95 %", "margin", "pairs", "others")]
     for row in rows:
         entry = entries[row.metric]
-        verdict = str(entry["verdict"])
-        if entry["more_scenes"]:
-            verdict += f", at least {entry['more_scenes']} more scenes"
+        verdict: str = entry.verdict
+        if entry.more_scenes:
+            verdict += f", at least {entry.more_scenes} more scenes"
         scale = 100.0 if known.shown(row.metric).in_percent else 1.0
-        margin = f"{scale * entry['margin']:g}"
-        pairs = f"{entry['n_cells']} in {plural(int(entry['n_scenes']), 'scene')}"
-        numbers = (row.diff.text, row.p_value.text, entry["difference"], row.interval.text)
+        margin = f"{scale * entry.margin:g}"
+        pairs = f"{entry.n_cells} in {plural(entry.n_scenes, 'scene')}"
+        contrast = entry.difference or NONE_SHOWN
+        numbers = (row.diff.text, row.p_value.text, contrast, row.interval.text)
         lines.append((row.metric, *numbers, margin, pairs, verdict))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     if 2 * len(widths) + sum(widths) > terminal_width():
@@ -190,20 +200,20 @@ def _table(
     return texts
 
 
-def _missing(entries: Mapping[str, JsonView], most: int) -> list[str]:
+def _missing(entries: Mapping[str, Difference], most: int) -> list[str]:
     """List missing pairs: metrics without any, rollouts without any, and metrics that lack some rollouts;
     ``most`` names a line.
     """
-    paired = {metric: entry for metric, entry in entries.items() if entry["n_cells"]}
+    paired = {metric: entry for metric, entry in entries.items() if entry.n_cells}
     unpaired: dict[str, list[str]] = {}  # reason -> metrics
     for metric in sorted(entries.keys() - paired.keys()):
-        unpaired.setdefault(str(entries[metric].get("reason")), []).append(metric)
+        unpaired.setdefault(str(entries[metric].reason), []).append(metric)
     lines = [f"  no pair: {some_of(metrics, most)}: {why}" for why, metrics in unpaired.items()]
     lacking: dict[tuple[str, str], list[str]] = {}  # (cell, reason) -> metrics
     for metric, entry in paired.items():
-        for cell in entry["missing"]:
-            name = f"{cell['policy']}, {cell['scene']}, seed {cell['seed']}"
-            lacking.setdefault((name, cell["why"]), []).append(metric)
+        for cell in entry.missing:
+            name = f"{cell.policy}, {cell.scene}, seed {cell.seed}"
+            lacking.setdefault((name, cell.why), []).append(metric)
     for (name, reason), metrics in lacking.items():
         which = "every metric" if len(metrics) == len(paired) else ", ".join(metrics)
         lines.append(f"  no pair: {name}: {which}: {reason}")

@@ -16,6 +16,7 @@ from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.runs.fork import Change, fork_rollout
 from alpasim_plugin.runs.logged_rollout import find_rollout
 from alpasim_plugin.runs.tables import ensure_tables
+from evaluators.results import to_json
 
 EPILOG = """
 Examples:
@@ -62,12 +63,12 @@ def fork(
         "out": str(root),
         "fork": fork_facts,
         "exit_code": result.exit_code,
-        "summary": result.summary,
+        "summary": to_json(result.summary),
     }
     lines = []
     if fork_facts:
         lines.append(f"replay to {at:g} s   equal to the log, bit for bit")
     show(as_json, facts, *lines, f"report   {root / 'report.html'}")
-    for failed in () if as_json else result.summary["failures"]["cells"]:
-        warn(failed["path"], *error_lines(failed["error"]))
+    for failed in () if as_json else result.summary.failures.cells:
+        warn(failed.path, *error_lines(to_json(failed.error)))
     raise typer.Exit(result.exit_code)

@@ -89,7 +89,7 @@ def gate(
     if note := stopping_note(run):
         warn(note)
     spec, source = load_gate(gate_file, stored_run.table)
-    preset = str(stored_run.summary.get("preset"))
+    preset = stored_run.summary.preset
     if spec.preset is not None and spec.preset != preset:
         raise InputError(
             f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
@@ -100,8 +100,8 @@ def gate(
         verdict = boundary_verdict(
             table_of_run(stored_run),
             spec,
-            stored_run.summary.get("boundary"),
-            None if earlier is None else earlier.get("boundary", {}),
+            stored_run.summary.boundary,
+            None if earlier is None else earlier.boundary or {},
             str(baseline_file or ""),
         )
     else:

@@ -42,7 +42,8 @@ def list_runs(
     stored = {
         name
         for entry in chosen
-        for table in (entry.summary.get("metrics") or {}).values()
+        if entry.summary is not None
+        for table in entry.summary.metrics.values()
         for name in table
     }
     for name in metrics:
@@ -65,7 +66,8 @@ def _values(entry: RunEntry, metrics: Sequence[str]) -> list[dict[str, Any]]:
     rows = []
     for renderer, policy in entry.variants:
         for name in metrics:
-            values = entry.metric(name, renderer, policy)
+            mean = entry.metric(name, renderer, policy)
             row = {"renderer": renderer, "policy": policy, "metric": name}
-            rows.append(row | {key: values.get(key) for key in VALUES})
+            values = {key: None if mean is None else getattr(mean, key) for key in VALUES}
+            rows.append(row | values)
     return rows

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -46,6 +46,7 @@ from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, exec
 from alpasim_plugin.runs.vary import BoundarySearch, parse_sweeps
 from evaluators import preset as find_preset
 from evaluators.pages.decision import decision_lines
+from evaluators.results import FailedRollout, to_json
 from evaluators.statistics.decision import Question, metric_question
 from evaluators.statistics.gate import load_gate
 from evaluators.statistics.numbers import plural
@@ -255,7 +256,11 @@ def run(
         _print_decision(search, root, as_json)
         raise typer.Exit(search.outcome.exit_code)
     if as_json:
-        facts = {"out": str(root), "exit_code": result.exit_code, "summary": result.summary}
+        facts = {
+            "out": str(root),
+            "exit_code": result.exit_code,
+            "summary": to_json(result.summary),
+        }
         show(as_json, facts)
     else:
         _print_result(result)
@@ -352,18 +357,18 @@ def _print_result(result: RunResult) -> None:
     root = result.root
     run = read_run(root)
     lines = []
-    if "repeat" in result.summary:
-        lines.append(f"repeat   {repeat_line(result.summary['repeat'])}")
+    if result.summary.repeat is not None:
+        lines.append(f"repeat   {repeat_line(result.summary.repeat)}")
     show(False, {}, *first_screen(run), "", *lines, *report_lines(root), next_line(run))
-    failures: dict[str, list[dict[str, Any]]] = {}
-    for cell in result.summary["failures"]["cells"]:
-        failures.setdefault(cell["error"]["message"], []).append(cell)
+    failures: dict[str, list[FailedRollout]] = {}
+    for cell in result.summary.failures.cells:
+        failures.setdefault(cell.error.message, []).append(cell)
     for message, cells in list(failures.items())[:SHOWN_FAILURES]:
-        warn(f"failed in {plural(len(cells), 'rollout')}: {message} -> {cells[0]['error']['hint']}")
-        for line in last_output(root / cells[0]["path"] / OUTPUT_NAME):
+        warn(f"failed in {plural(len(cells), 'rollout')}: {message} -> {cells[0].error.hint}")
+        for line in last_output(root / cells[0].path / OUTPUT_NAME):
             warn(f"        {line}")
     if result.n_failed:
-        by_policy = result.summary["failures"]["by_class"].get("policy", 0)
+        by_policy = result.summary.failures.by_class.get("policy", 0)
         advice = "the same command runs them again"
         if by_policy:
             advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"

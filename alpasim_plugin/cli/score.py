@@ -17,6 +17,7 @@ from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import presets
 from evaluators.pages.terminal import render_presets
+from evaluators.results import to_json
 from evaluators.statistics.opening import read_run
 from evaluators.statistics.verdicts import worst_code
 
@@ -97,9 +98,9 @@ def score(
     if len(names) > 1 or any(one.protocol for one in chosen.values()):
         lines.append(render_presets({name: one.summary for name, one in results.items()}))
     for result in () if as_json else results.values():
-        for cell in result.summary["failures"]["cells"][:SHOWN_FAILURES]:
-            warn(*error_lines(cell["error"]))
-        aggregation = result.summary.get("alpasim") or {}
+        for cell in result.summary.failures.cells[:SHOWN_FAILURES]:
+            warn(*error_lines(to_json(cell.error)))
+        aggregation = result.summary.alpasim or {}
         if aggregation.get("skipped"):
             warn(f"AlpaSim's aggregation was not written: {aggregation['skipped']}")
         if aggregation.get("error"):

@@ -27,6 +27,7 @@ from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.pages.cells import Wanted
 from evaluators.pages.page import MB, write_page
 from evaluators.pages.terminal import metric_lines
+from evaluators.results import to_json
 from evaluators.statistics.opening import Run as OpenedRun
 from evaluators.statistics.opening import read_run
 
@@ -79,7 +80,7 @@ def view(
     opened = OpenedRun.read_so_far(root)
     for line in opened.damage:
         warn(f"warning: damaged: {line}")
-    if not opened.summary:
+    if not opened.is_finished:
         done = len(opened.rollouts)
         warn(f"note: the run is not finished: {done} of {opened.planned} rollouts")
     if not opened.rollouts:
@@ -159,7 +160,7 @@ def report(
     ensure_tables(folder, warn)
     page = write_reports(folder)
     opened = read_run(folder)
-    facts = {"report": str(page), "summary": opened.summary}
+    facts = {"report": str(page), "summary": to_json(opened.summary)}
     lines = first_screen(opened)
     if every:
         lines += ["", *metric_lines(opened.summary, known=opened.table)]

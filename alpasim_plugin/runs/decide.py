@@ -22,6 +22,7 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import rollout_table
 from alpasim_plugin.runs.plan import RunPlan, part_of
 from alpasim_plugin.runs.run import Progress
+from evaluators.results import Outcome
 from evaluators.statistics.decision import (
     MOST_SCENES,
     SCHEMA_VERSION,
@@ -42,7 +43,7 @@ from evaluators.statistics.variants import (
     usual_base,
     variants_of,
 )
-from evaluators.statistics.verdicts import Outcome, outcome_of_failures
+from evaluators.statistics.verdicts import outcome_of_failures
 
 SCENES_PER_LOOK = 5
 ORDER_SEED = 0

@@ -327,7 +327,7 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     write_run_json(root, read_run_json(root) | {"kind": "fork", "fork": manifest.get("fork")})
     pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
     summary = finish_run(root, [original, manifest], {"pool": pool})
-    return RunResult(root, summary, 2, summary["failures"]["n_failed"])
+    return RunResult(root, summary, 2, summary.failures.n_failed)
 
 
 def _parts(

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TypedDict
 
 from alpasim_plugin import __version__
 from alpasim_plugin.core.json_types import JsonObject
+from evaluators.results import FixerFacts
 
 PACKAGES = (
     "numpy",
@@ -38,7 +40,6 @@ GIT = (
 )
 ALONE = {"GIT_ALLOW_PROTOCOL": "none", "GIT_NO_LAZY_FETCH": "1"}
 _COMMIT = re.compile(r"[0-9a-f]{7,64}")
-COUNTS = ("predicted", "hits", "drafts", "redrafts")
 
 
 def versions() -> dict[str, str]:
@@ -170,39 +171,48 @@ def _no_filters(folder: Path | None) -> list[str]:
     ]
 
 
-def fixers(manifests: Sequence[JsonObject]) -> JsonObject:
-    """Return for each renderer with a fixer: ``label``, ``trained``, ``mode``, ``rollouts`` and
-    ``frames``; ``blocks`` unless the mode is ``frame``.
-
-    In speculative mode also the counts of `block_fixers.speculation.SpeculationStats` over
-    rollouts, ``hit_rate`` (the share of predicted frames within tolerance), and the largest
-    ``forecast_error`` and ``shown_error``.
+def fixers(manifests: Sequence[JsonObject]) -> dict[str, FixerFacts]:
+    """Return what the fixer of each renderer with one did.
 
     Args:
         manifests: Of finished rollouts of one policy.
     """
-    out: JsonObject = {}
-    for name in dict.fromkeys(m["renderer"] for m in manifests):
-        facts = [m["fixer"] for m in manifests if m["renderer"] == name and m.get("fixer")]
-        if not facts:
-            continue
-        entry = {key: facts[0][key] for key in ("label", "trained", "mode")} | {
-            "rollouts": len(facts)
-        }
-        entry |= {
-            key: sum(one[key] for one in facts) for key in ("frames", "blocks") if key in facts[0]
-        }
-        if entry["mode"] == "speculative":
-            entry |= {key: sum(one[key] for one in facts) for key in COUNTS}
-            entry["hit_rate"] = (
-                round(entry["hits"] / entry["predicted"], 4) if entry["predicted"] else None
-            )
-            entry |= {
-                key: _largest(one[key] for one in facts)
-                for key in ("forecast_error", "shown_error")
-            }
-        out[name] = entry
-    return out
+    facts: dict[str, list[JsonObject]] = {}
+    for manifest in manifests:
+        if manifest.get("fixer"):
+            facts.setdefault(manifest["renderer"], []).append(manifest["fixer"])
+    return {renderer: _fixer_facts(rollouts) for renderer, rollouts in facts.items()}
+
+
+def _fixer_facts(rollouts: Sequence[JsonObject]) -> FixerFacts:
+    """Add up what a fixer did in the rollouts of its renderer."""
+    first = rollouts[0]
+
+    def total(name: str) -> int:
+        return sum(int(rollout[name]) for rollout in rollouts)
+
+    facts = FixerFacts(
+        label=first["label"],
+        trained=first["trained"],
+        mode=first["mode"],
+        rollouts=len(rollouts),
+        frames=total("frames"),
+        blocks=total("blocks") if "blocks" in first else None,
+    )
+    if facts.mode != "speculative":
+        return facts
+    predicted, hits, redrafts, blocks = map(total, ("predicted", "hits", "redrafts", "blocks"))
+    return replace(
+        facts,
+        predicted=predicted,
+        hits=hits,
+        drafts=total("drafts"),
+        redrafts=redrafts,
+        hit_rate=round(hits / predicted, 4) if predicted else None,
+        redrafts_per_block=redrafts / blocks if blocks else None,
+        forecast_error=_largest(rollout["forecast_error"] for rollout in rollouts),
+        shown_error=_largest(rollout["shown_error"] for rollout in rollouts),
+    )
 
 
 def _largest(errors: Iterable[dict[str, float | None]]) -> dict[str, float | None]:

@@ -44,8 +44,9 @@ from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
 from alpasim_plugin.runs.summary import pool_of, write_summary
 from evaluators.metrics import table_of
+from evaluators.results import Outcome, Summary
 from evaluators.statistics.decision import State
-from evaluators.statistics.verdicts import Outcome, outcome_of_failures
+from evaluators.statistics.verdicts import outcome_of_failures
 from scenarios.suite import ScenarioRef
 
 SCHEMA_VERSION = 1
@@ -119,14 +120,14 @@ class RunResult:
     """Result of a run."""
 
     root: Path
-    summary: JsonObject
+    summary: Summary
     n_rollouts: int
     n_failed: int
 
     @property
     def outcome(self) -> Outcome:
         """Give the outcome: failures of rollouts and of their scoring. Gates add criteria to it."""
-        return outcome_of_failures(self.summary["failures"])
+        return outcome_of_failures(self.summary.failures)
 
     @property
     def exit_code(self) -> int:
@@ -215,7 +216,7 @@ def execute_run(
         finally:
             end_children()
         summary = finish_run(root, manifests, more, report)
-    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+    return RunResult(root, summary, len(manifests), summary.failures.n_failed)
 
 
 def execute_search(
@@ -252,12 +253,12 @@ def execute_search(
         kept = {key: held[key] for key in ("started_at",) if key in held}
         write_run_json(root, read_run_json(root) | kept | {"kind": search.kind})
         summary = finish_run(root, manifests, {"pool": pool} | search.facts(), report)
-    return RunResult(root, summary, len(manifests), summary["failures"]["n_failed"])
+    return RunResult(root, summary, len(manifests), summary.failures.n_failed)
 
 
 def finish_run(
     root: Path, manifests: Sequence[JsonObject], more: JsonView, report: bool = True
-) -> JsonObject:
+) -> Summary:
     """Write the tables and the reports of a run whose rollouts are done; return the summary.
 
     ``summary.json`` is the last of the tables: a run folder without it is unfinished.

@@ -33,6 +33,7 @@ from evaluators.alpasim import (
 )
 from evaluators.metrics import METRICS, MetricTable, table_of
 from evaluators.metrics.presets import Preset
+from evaluators.results import Summary, to_json
 from evaluators.statistics.reduce import RolloutValue
 
 
@@ -41,12 +42,16 @@ class ScoreResult:
     """Result of scoring: the run folder, its summary and the process exit code."""
 
     root: Path
-    summary: JsonObject
+    summary: Summary
     exit_code: int
 
     def as_dict(self) -> JsonObject:
         """Return the result for JSON."""
-        return {"out": str(self.root), "exit_code": self.exit_code, "summary": self.summary}
+        return {
+            "out": str(self.root),
+            "exit_code": self.exit_code,
+            "summary": to_json(self.summary),
+        }
 
 
 def execute_score(

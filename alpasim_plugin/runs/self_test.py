@@ -10,10 +10,11 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import Progress, execute_run
 from evaluators.metrics.presets import DEFAULT
+from evaluators.results import Outcome
 from evaluators.statistics.baselines import table_of_run
 from evaluators.statistics.gate import GateSpec, GateVerdict, check_gate
 from evaluators.statistics.opening import read_run
-from evaluators.statistics.verdicts import Outcome, outcome_of_failures, worst
+from evaluators.statistics.verdicts import outcome_of_failures, worst
 from scenarios.suite import load_suite
 
 SUITE = "suites/gate_self_test"
@@ -75,7 +76,7 @@ def run_self_test(
         execute_run(plan, root, None, command, progress),
         execute_run(control, root / "control", None, command, progress),
     ]
-    failed = worst([outcome_of_failures(result.summary["failures"]) for result in results])
+    failed = worst([outcome_of_failures(result.summary.failures) for result in results])
     first, again = (table_of_run(read_run(folder)) for folder in (root, root / "control"))
     trials = [Trial(name, True, gate_against(first, spec, first, name)) for name in broken]
     trials.append(Trial(CONTROL, False, gate_against(again, spec, first, REFERENCE)))

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
@@ -23,24 +24,24 @@ from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import fixers
 from evaluators import censoring
 from evaluators.metrics import MetricTable
+from evaluators.results import (
+    FailedRollout,
+    Failures,
+    Pool,
+    RolloutError,
+    Speed,
+    StageSpeed,
+    Summary,
+    to_json,
+)
 from evaluators.statistics.outcomes import outcome_table, times_of
 from evaluators.statistics.summary import by_policy, numbers
 from evaluators.statistics.variants import base_named, variants_in
 
-SPEEDS = (
-    "ms_per_frame_p50",
-    "ms_per_frame_p95",
-    "ms_per_frame_mean",
-    "frames_per_s",
-    "first_frame_ms",
-)
-# Members of run.json that are in the summary too.
-IN_SUMMARY = ("pool", "repeat", "exit_code", "alpasim", "boundary")
-
 
 def write_summary(
     root: Path, info: JsonView, manifests: Sequence[JsonObject], tables: Path
-) -> JsonObject:
+) -> Summary:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
     Args:
@@ -49,35 +50,77 @@ def write_summary(
         manifests: One per rollout, in the order of the tables.
         tables: Folder to write to.
     """
-    known = MetricTable.of_run(info)
     rollouts = write_tables(root, manifests, tables)
-    done = [m for m in manifests if m["status"] == "ok"]
-    failed = [m for m in manifests if m["status"] != "ok"]
-    by_class = dict(Counter(m["error"]["failure_class"] for m in failed))
-    cells = [{k: m[k] for k in (*KEYS, "path", "error")} for m in failed]
-    summary = {
-        "preset": info["preset"],
-        "outcomes": outcome_table(rollouts_of_table(rollouts), times_of(manifests)),
-        **numbers(
-            RolloutTable.of_table(rollouts),
-            info["config"].get("baseline"),
-            info.get("bases") or {},
-            known,
-        ),
-        "censoring": by_policy(_of_policies(manifests), lambda some: censoring(some, known)),
-        "failures": {
-            "n_failed": len(failed),
-            "n_rollouts": len(manifests),
-            "by_class": by_class,
-            "cells": cells,
-        },
-        "copies": sum("copied_from" in m for m in manifests),
-        "fixers": by_policy(_of_policies(done), fixers),
-        "speed": by_policy(_of_policies([m for m in done if m.get("stage_ms")]), _speeds),
-        **{name: info[name] for name in IN_SUMMARY if name in info},
-    }
-    write_json(tables / SUMMARY, summary)
+    summary = summary_of(info, manifests, rollouts)
+    write_json(tables / SUMMARY, to_json(summary))
     return summary
+
+
+def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Table) -> Summary:
+    """Return the results of a run.
+
+    Args:
+        info: ``run.json``.
+        manifests: One per rollout, in the order of the tables.
+        rollouts: The content of ``rollouts.parquet``.
+    """
+    known = MetricTable.of_run(info)
+    reasons = _invalid_reasons(manifests)
+    table = RolloutTable.of_table(
+        rollouts, lambda renderer, metric: reasons.get((renderer, metric), "")
+    )
+    means = numbers(table, info["config"].get("baseline"), info.get("bases") or {}, known)
+    of_policy = _of_policies(manifests)
+    finished = {
+        policy: [manifest for manifest in own if manifest["status"] == "ok"]
+        for policy, own in of_policy.items()
+    }
+    pool = info.get("pool")
+    return Summary(
+        preset=info["preset"],
+        metrics=means.metrics,
+        paired=means.paired,
+        paired_with_base=means.paired_with_base,
+        paired_policies=means.paired_policies,
+        failures=failures_of(manifests),
+        outcomes=outcome_table(rollouts_of_table(rollouts), times_of(manifests)),
+        censoring=by_policy({policy: censoring(own, known) for policy, own in of_policy.items()}),
+        copies=sum("copied_from" in manifest for manifest in manifests),
+        fixers=by_policy({policy: fixers(own) for policy, own in finished.items()}),
+        speed=by_policy({policy: _speeds(own) for policy, own in finished.items()}),
+        pool=None if pool is None else Pool(**pool),
+        repeat=info.get("repeat"),
+        exit_code=info.get("exit_code"),
+        alpasim=info.get("alpasim"),
+        boundary=info.get("boundary"),
+    )
+
+
+def _invalid_reasons(manifests: Sequence[JsonObject]) -> dict[tuple[str, str], str]:
+    """Return for each renderer and metric why rollouts have no valid value: the most frequent
+    reason.
+    """
+    counts: dict[tuple[str, str], Counter[str]] = {}
+    for manifest in manifests:
+        for metric, entry in manifest["metrics"].items() if manifest["status"] == "ok" else ():
+            if not entry["valid"] and entry["reason"]:
+                key = manifest["renderer"], metric
+                counts.setdefault(key, Counter())[entry["reason"]] += 1
+    return {key: reasons.most_common(1)[0][0] for key, reasons in counts.items()}
+
+
+def failures_of(manifests: Sequence[JsonObject]) -> Failures:
+    """Return which rollouts could not be run or scored, and how many of each class."""
+    failed = [manifest for manifest in manifests if manifest["status"] != "ok"]
+    cells = tuple(
+        FailedRollout(
+            **{key: manifest[key] for key in (*KEYS, "path")},
+            error=RolloutError(**manifest["error"]),
+        )
+        for manifest in failed
+    )
+    by_class = Counter(cell.error.failure_class for cell in cells)
+    return Failures(len(failed), len(manifests), dict(by_class), cells)
 
 
 def _of_policies(manifests: Sequence[JsonObject]) -> dict[str, list[JsonObject]]:
@@ -87,12 +130,13 @@ def _of_policies(manifests: Sequence[JsonObject]) -> dict[str, list[JsonObject]]
     return found
 
 
-def _speeds(manifests: Sequence[JsonObject]) -> JsonObject:
-    renderers = list(dict.fromkeys(m["renderer"] for m in manifests))
-    return {name: speed([m for m in manifests if m["renderer"] == name]) for name in renderers}
+def _speeds(manifests: Sequence[JsonObject]) -> dict[str, Speed]:
+    timed = [manifest for manifest in manifests if manifest.get("stage_ms")]
+    renderers = dict.fromkeys(manifest["renderer"] for manifest in timed)
+    return {name: speed([m for m in timed if m["renderer"] == name]) for name in renderers}
 
 
-def speed(manifests: Sequence[JsonObject]) -> JsonObject:
+def speed(manifests: Sequence[JsonObject]) -> Speed:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
     A frame's time is the sum of all stages of the loop between two frames; the time of a block is
@@ -117,30 +161,30 @@ def speed(manifests: Sequence[JsonObject]) -> JsonObject:
         first.append(float(total[:opening].sum()))
         per_frame.extend(total[opening:].tolist())
     if not per_frame:
-        return dict.fromkeys(SPEEDS) | {"stages": {}}
+        return Speed(None, None, None, None, None, {})
     all_ms = sum(sum(d) for d in stages.values())
-    return {
-        "ms_per_frame_p50": round(float(np.percentile(per_frame, 50)), 3),
-        "ms_per_frame_p95": round(float(np.percentile(per_frame, 95)), 3),
-        "ms_per_frame_mean": round(float(np.mean(per_frame)), 3),
-        "frames_per_s": round(1e3 / float(np.mean(per_frame)), 2),
-        "first_frame_ms": round(float(np.median(first)), 3),
-        "stages": {name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
-    }
+    return Speed(
+        ms_per_frame_p50=round(float(np.percentile(per_frame, 50)), 3),
+        ms_per_frame_p95=round(float(np.percentile(per_frame, 95)), 3),
+        ms_per_frame_mean=round(float(np.mean(per_frame)), 3),
+        frames_per_s=round(1e3 / float(np.mean(per_frame)), 2),
+        first_frame_ms=round(float(np.median(first)), 3),
+        stages={name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
+    )
 
 
-def _stage(durations: Sequence[float], all_ms: float, frames: int) -> dict[str, float]:
+def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed:
     """Return percentiles of the passes that took place (a frame from a draft has none through the
     fixer), share and mean per frame.
     """
     passes = [d for d in durations if d > 0.0]
     total = sum(durations)
-    return {
-        "p50_ms": round(float(np.percentile(passes, 50)), 3),
-        "p95_ms": round(float(np.percentile(passes, 95)), 3),
-        "share": round(total / all_ms, 4),
-        "per_frame_ms": round(total / frames, 3),
-    }
+    return StageSpeed(
+        p50_ms=round(float(np.percentile(passes, 50)), 3),
+        p95_ms=round(float(np.percentile(passes, 95)), 3),
+        share=round(total / all_ms, 4),
+        per_frame_ms=round(total / frames, 3),
+    )
 
 
 def pool_of(
@@ -165,9 +209,9 @@ def pool_of(
     }
 
 
-def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObject:
-    """Return the numbers of all rollouts of some runs, such as the parts of a night, in the form of
-    ``summary.json``.
+def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> Summary:
+    """Return the numbers of all rollouts of some runs, such as the parts of a night: means, paired
+    differences and failures.
 
     A cell (renderer, policy, scene, seed) that several runs hold counts once, with the mean of its
     repeats, as in a single run.
@@ -176,10 +220,6 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObj
         runs: Finished run folders.
         baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with; None is the
             first run's.
-
-    Returns:
-        ``runs``, ``preset``, ``metrics``, ``paired``, ``paired_with_base``, ``paired_policies``,
-        ``failures`` (docs/statistics.md).
 
     Raises:
         InputError: A run is not finished or its tables are damaged; presets differ, or a scene or a
@@ -203,16 +243,16 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> JsonObj
         name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()
     }
     by_class = table.failures()
-    return {
-        "runs": [str(run) for run in runs],
-        "preset": first["preset"],
-        **numbers(table, baseline or first["config"].get("baseline"), bases, known),
-        "failures": {
-            "n_failed": sum(by_class.values()),
-            "n_rollouts": table.n_rollouts,
-            "by_class": by_class,
-        },
-    }
+    means = numbers(table, baseline or first["config"].get("baseline"), bases, known)
+    return Summary(
+        preset=first["preset"],
+        metrics=means.metrics,
+        paired=means.paired,
+        paired_with_base=means.paired_with_base,
+        paired_policies=means.paired_policies,
+        failures=Failures(sum(by_class.values()), table.n_rollouts, by_class),
+        runs=tuple(str(run) for run in runs),
+    )
 
 
 def joined_metrics(runs: Sequence[Path]) -> MetricTable:

@@ -349,7 +349,7 @@ def index_data(
         report: Address of the run's report, or "".
     """
     ids = {cell.id for cell in here}
-    tables = (run.summary.get("metrics") or {}).values()
+    tables = run.summary.metrics.values()
     metrics = {}
     for name in run.table.ordered({*run.table, *(name for table in tables for name in table)}):
         metric = run.table.shown(name)

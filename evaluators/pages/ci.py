@@ -86,9 +86,9 @@ def write_summary_md(run: Run) -> Path:
                 p.p_value.text,
                 p.verdict,
             ]
-            for p in tables.pair_rows(run.summary, run.table)
+            for p in tables.pair_rows(run.summary.differences, run.table)
         ]
-        note = contact_note(str(run.summary.get("preset")))
+        note = contact_note(run.summary.preset)
         text = MARKDOWN.get_template("summary.md.j2").render(
             metric_heads=["metric", *heads],
             metrics=metrics,
@@ -170,7 +170,8 @@ def write_junit(run: Run) -> Path:
 
 def _write_suites(path: Path, suites: Sequence[Suite]) -> Path:
     time_s = sum(suite.time_s for suite in suites)
-    text = JUNIT.get_template("junit.xml.j2").render(suites=suites, time_s=time_s)
+    cases = [case for suite in suites for case in suite.cases]
+    text = JUNIT.get_template("junit.xml.j2").render(suites=suites, cases=cases, time_s=time_s)
     write_text(path, text)
     return path
 
@@ -186,7 +187,7 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
     """
     asked = run.info.get("asked") or []  # what the command named, if that was one thing
     facts = {
-        "preset": run.summary.get("preset"),
+        "preset": run.summary.preset,
         "version": run.info.get("version"),
         "key": run.info.get("key"),
         "command": " ".join(str(word) for word in run.info.get("command") or []),

@@ -8,10 +8,10 @@ from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.pages.charts import INK, MUTED, VARIANT, Chart, chart_of, new_axes
 from evaluators.pages.gate import tone_of_cause
+from evaluators.results import WORDS
 from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.numbers import labelled, printed, scale_and_unit
 from evaluators.statistics.opening import Run
-from evaluators.statistics.verdicts import WORDS
 
 WORST_CASE = "any bound"
 

@@ -117,10 +117,10 @@ def baseline_of(run: Run) -> str | None:
     """Return the renderer that the others are compared with: as in the paired differences, else the
     first one.
     """
-    for pairs in (run.summary.get("paired") or {}).values():
+    for pairs in run.summary.paired.values():
         for entry in pairs.values():
-            if entry.get("baseline") in run.renderers:
-                return str(entry["baseline"])
+            if entry.baseline in run.renderers:
+                return entry.baseline
     return next(iter(run.renderers), None)
 
 

@@ -18,10 +18,10 @@ from alpasim_plugin.log.run_folder.checksums import (
 )
 from alpasim_plugin.log.run_folder.reader import read_json, table_path
 from alpasim_plugin.log.run_folder.schema import GATE_FILES, ROLLOUTS, WHY_NAME
+from evaluators.results import WORDS
 from evaluators.statistics.gate import GateVerdict
 from evaluators.statistics.numbers import short
 from evaluators.statistics.opening import Run
-from evaluators.statistics.verdicts import WORDS
 
 WORST = 5  # scenes of a check that are named
 TONES = {"pass": "better", "regression": "worse", "undecided": "unclear"}

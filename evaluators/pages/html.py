@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 import shlex
 from collections.abc import Mapping
 from contextlib import suppress
@@ -24,7 +25,7 @@ from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.rows import Series, series_by_cell
-from alpasim_plugin.log.run_folder.schema import AGAIN, KEYS, WHY_NAME
+from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.pages import tables
 from evaluators.pages.above import still_map
@@ -36,7 +37,7 @@ from evaluators.pages.gate import gate_section
 from evaluators.pages.overview import TONES, overview_of
 from evaluators.pages.rollouts import SERIES, rollout_block
 from evaluators.pages.worst import worst_change
-from evaluators.statistics.numbers import DASH, listed_counts, percents, plural, short
+from evaluators.statistics.numbers import DASH, fixed, listed_counts, percents, plural, short
 from evaluators.statistics.opening import Run, read_run
 
 MAX_SCENE_PLOTS = 24
@@ -101,7 +102,15 @@ def environment_of(*packages: str) -> Environment:
         lstrip_blocks=True,
     )
     environment.globals.update(plural=plural, short=short, dash=DASH)
-    environment.filters.update(listed_counts=listed_counts, percents=percents)
+    environment.filters.update(
+        beyond=lambda items, n: max(len(items) - n, 0),
+        degrees=lambda radians: f"{math.degrees(radians):.1f}",
+        listed_counts=listed_counts,
+        percent=lambda share, places: f"{fixed(100 * share, places)} %",
+        percents=percents,
+        seconds=lambda t_us: f"{t_us / 1e6:.1f}",
+        total=lambda counts: sum(counts.values()),
+    )
     return environment
 
 
@@ -120,7 +129,7 @@ def context(run: Run) -> dict[str, Any]:
     series = series_by_cell(run.steps(SERIES, looked_at)) if looked_at else {}
     views, no_view = scene_views(run, series, looked_at, variant_of)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
-    pairs = tables.pair_rows(run.summary, run.table)
+    pairs = tables.pair_rows(run.summary.differences, run.table)
     # every column has the colour of its renderer, or of its policy where there is one renderer
     colours = {}
     for i, variant in enumerate(run.variants):
@@ -128,8 +137,6 @@ def context(run: Run) -> dict[str, Any]:
         colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
-    speeds = [entry.get("stages") or {} for entry in (run.summary.get("speed") or {}).values()]
-    cells = (run.summary.get("failures") or {}).get("cells") or ()
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -138,7 +145,7 @@ def context(run: Run) -> dict[str, Any]:
         "ending_tones": TONES,
         "shots": worst_change(run),
         "decision": decision_section(run),
-        "boundary": boundary_section(run.summary.get("boundary")),
+        "boundary": boundary_section(run.summary.boundary),
         "gate": gate_section(run),
         "columns": tables.columns(run),
         "variant_colour": colours,
@@ -149,6 +156,8 @@ def context(run: Run) -> dict[str, Any]:
             if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))
         },
         "more_flips": more_flips,
+        "n_flips": len(flips) + more_flips,
+        "n_invalid": sum(len(ledger.invalid) for ledger in run.summary.censoring.values()),
         "flip_pairs": flip_pairs,
         "baseline": " or ".join(base.name for base in flip_bases(run)),
         "metric_rows": rows,
@@ -160,11 +169,16 @@ def context(run: Run) -> dict[str, Any]:
         "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
         "refused": refused,
-        "pool": pool_text(run.summary.get("pool") or {}),
-        "stages": list(dict.fromkeys(name for stages in speeds for name in stages)),
+        "pool": pool_text(run.summary.pool),
+        "stages": list(
+            dict.fromkeys(name for speed in run.summary.speed.values() for name in speed.stages)
+        ),
         "every_rollout": rollout_block(run),
         "failed": [rollout for rollout in run.rollouts if not rollout.ok],
-        "hints": {tuple(cell[key] for key in KEYS): cell["error"].get("hint") for cell in cells},
+        "hints": {
+            (cell.renderer, cell.policy, cell.scene, cell.seed): cell.error.hint
+            for cell in run.summary.failures.cells
+        },
         "command": command_of(run),
     }
 

@@ -1,9 +1,6 @@
 """The one table of a run: how the rollouts of each variant ended, its primary rate and how that
 differs from its baseline's, its distance and its frame time. The terminal, report.html, summary.md
 and gate.md print this object.
-
-A difference is called what the paired comparison says and its correction for several variants
-(`evaluators.statistics.verdicts`) leaves; nothing is tested here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,27 +8,23 @@ from dataclasses import dataclass
 from typing import Literal
 
 from alpasim_plugin.core.files import some_of
-from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.log.run_folder.shapes import pair_tables
+from alpasim_plugin.core.types import MetricInfo
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
 from evaluators.pages.decision import verdict_text
 from evaluators.pages.fixers import fixer_cautions
+from evaluators.results import Difference, Endings, Mean
 from evaluators.statistics.decision import read_decision
 from evaluators.statistics.numbers import (
     DASH,
     count_of,
-    finite,
     fixed,
-    interval,
     plural,
     printed,
     scale_and_unit,
     short,
 )
 from evaluators.statistics.opening import Run
-from evaluators.statistics.outcomes import DISTANCE, outcome_table
 from evaluators.statistics.sentences import MANY_SCENES
-from evaluators.statistics.verdicts import shown_questions
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral"]
 
@@ -56,7 +49,7 @@ PLACES = 2  # of failures that are named
 
 
 @dataclass(frozen=True)
-class Difference:
+class PrimaryDifference:
     """A variant's primary metric minus its baseline's, in printed units.
 
     Attributes:
@@ -74,6 +67,11 @@ class Difference:
     text: str
     n_scenes: int
     more_scenes: int | None
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """Give the ends of the band of the margin."""
+        return -self.margin, self.margin
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class VariantRow:
     name: str
     endings: Mapping[str, int]
     primary: str
-    difference: Difference | None
+    difference: PrimaryDifference | None
     distance: str
     is_cut_short: bool
     frame_ms: str
@@ -247,29 +245,36 @@ class Overview:
         low, high = self.limits
         return (value - low) / (high - low)
 
+    def place(self, value: float) -> str:
+        """Return where a difference lies on the axis, for a style sheet."""
+        return f"{100 * self.share(value):.2f}%"
+
+    def width(self, ends: tuple[float, float]) -> str:
+        """Return how long a stretch of the axis is, for a style sheet."""
+        return f"{100 * (self.share(ends[1]) - self.share(ends[0])):.2f}%"
+
 
 def overview_of(run: Run) -> Overview:
     """Lay out the first screen of a run."""
-    table = run.summary.get("outcomes") or outcome_table(run.rollouts)
+    summary = run.summary
     decision = read_decision(run.folder)
-    boundary = run.summary.get("boundary")
+    boundary = summary.boundary
     is_sequential = decision is not None or boundary is not None
     differences = {} if is_sequential else differences_of(run)
-    rows = tuple(_row(run, name, entry, differences) for name, entry in table.items())
+    rows = tuple(_row(run, name, entry, differences) for name, entry in summary.outcomes.items())
     primary = run.table.shown(run.table.primary)
     asked = run.info.get("asked") or ()
     size = (plural(len(run.scenes), "scene"), plural(len(run.info.get("seeds") or ()), "seed"))
     named = some_of(asked, 2)
-    parts = [*([named] if named else []), str(run.summary.get("preset")), " \u00d7 ".join(size)]
+    parts = [*([named] if named else []), summary.preset, " \u00d7 ".join(size)]
     if len(run.policies) == 1:
         parts.append(f"policy {run.policies[0]}")
     elif len(run.renderers) == 1:
         parts.append(f"renderer {run.renderers[0]}")
-    cautions = fixer_cautions(run.summary)
-    copies = run.summary.get("copies")
-    if copies:
+    cautions = fixer_cautions(summary)
+    if summary.copies:
         cautions.append(
-            f"{copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
+            f"{summary.copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
             "a policy without a camera drives once for all renderers."
         )
     repeat = run.info.get("repeat") or {}
@@ -304,61 +309,58 @@ def variant_name(run: Run, name: str) -> str:
     return name.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else name
 
 
-def tone_of(entry: JsonView) -> Tone:
-    """Give the tone of one metric of ``summary.json``'s ``paired``.
+def tone_of(entry: Difference) -> Tone:
+    """Give the tone of a paired difference.
 
     Neutral means non-inferior: no worse than its margin, and not shown to be better.
     """
-    stated = entry.get("verdict")
-    shown = entry.get("difference")
-    if shown == "better" or (shown == "worse" and stated != "non-inferior"):
-        return "better" if shown == "better" else "worse"
-    known: dict[str, Tone] = {"worse": "worse", "undecided": "unclear"}
-    return known.get(str(stated), "neutral")
+    if entry.difference == "better":
+        return "better"
+    if entry.verdict == "non-inferior":
+        return "neutral"
+    return "worse" if "worse" in (entry.difference, entry.verdict) else "unclear"
 
 
-def differences_of(run: Run) -> dict[str, Difference]:
+def differences_of(run: Run) -> dict[str, PrimaryDifference]:
     """Return KEY of ``summary.json`` -> the primary difference of that variant: to the baseline's
     renderer where there are several, else to its policy.
     """
+    summary = run.summary
+    blocks = [summary.paired] if summary.paired else [summary.paired_with_base]
+    if not summary.paired:
+        blocks.append(summary.paired_policies)
     metric = run.table.shown(run.table.primary)
-    tables = pair_tables(run.summary)
-    entries = [(key, pairs.get(metric.name) or {}) for key, pairs in tables]
-    p_values = {
-        (number, metric.name): finite(entry.get("p_value"))
-        for number, (_, entry) in enumerate(entries)
-        if finite(entry.get("diff")) is not None
-    }
-    shown = shown_questions(p_values, metric.name)
-    of_renderers = len(run.summary.get("paired") or ())
-    scale, _ = scale_and_unit(metric, metric.unit)
-    found: dict[str, Difference] = {}
-    for number, metric_name in p_values:
-        key, entry = entries[number]
-        if key in found or (of_renderers and number >= of_renderers):
-            continue
-        tone = tone_of(entry)
-        if tone in ("worse", "better") and (number, metric_name) not in shown:
-            tone = "unclear"
-        bounds = interval(entry.get("ci95"))
-        values = [float(entry["diff"]), *(bounds or ())]
-        texts = printed(metric, *values, sign=True)
-        baseline = variant_name(run, str(entry.get("baseline") or "the baseline"))
-        verdict = f"{VERDICTS.get(tone, '')} {baseline}"
-        if tone in ("worse", "better") and entry.get("verdict") != "worse":
-            verdict += " on these scenes"
-        found[key] = Difference(
-            baseline,
-            scale * values[0],
-            (scale * bounds[0], scale * bounds[1]) if bounds else None,
-            scale * (finite(entry.get("margin")) or 0.0),
-            tone,
-            verdict,
-            f"{texts[0]} ({' to '.join(texts[1:])})" if bounds else texts[0],
-            int(entry.get("n_scenes") or 0),
-            entry.get("more_scenes") if tone == "unclear" else None,
-        )
+    found: dict[str, PrimaryDifference] = {}
+    for block in blocks:
+        for key, pairs in block.items():
+            entry = pairs.get(metric.name)
+            if key not in found and entry is not None and entry.diff is not None:
+                baseline = variant_name(run, entry.baseline)
+                found[key] = _primary_difference(metric, entry, entry.diff, baseline)
     return found
+
+
+def _primary_difference(
+    metric: MetricInfo, entry: Difference, diff: float, baseline: str
+) -> PrimaryDifference:
+    scale, _ = scale_and_unit(metric, metric.unit)
+    tone = tone_of(entry)
+    verdict = f"{VERDICTS.get(tone, '')} {baseline}"
+    if tone in ("worse", "better") and entry.verdict != "worse":
+        verdict += " on these scenes"
+    bounds = entry.ci95
+    texts = printed(metric, diff, *(bounds or ()), sign=True)
+    return PrimaryDifference(
+        baseline,
+        scale * diff,
+        (scale * bounds[0], scale * bounds[1]) if bounds else None,
+        scale * entry.margin,
+        tone,
+        verdict,
+        f"{texts[0]} ({' to '.join(texts[1:])})" if bounds else texts[0],
+        entry.n_scenes,
+        entry.more_scenes if tone == "unclear" else None,
+    )
 
 
 def decided(rows: Sequence[VariantRow]) -> str:
@@ -393,40 +395,48 @@ def decided(rows: Sequence[VariantRow]) -> str:
 
 
 def _row(
-    run: Run, variant: str, entry: JsonView, differences: Mapping[str, Difference]
+    run: Run, variant: str, entry: Endings, differences: Mapping[str, PrimaryDifference]
 ) -> VariantRow:
-    metrics = run.summary.get("metrics") or {}
+    summary = run.summary
     renderer = variant.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else variant
-    key = variant if variant in metrics else renderer
-    primary = metrics.get(key, {}).get(run.table.primary) or {}
-    mean = finite(primary.get("mean"))
-    n = int(primary.get("n_rollouts") or 0)
-    rate = DASH
-    if mean is not None:
-        in_percent = run.table.shown(run.table.primary).in_percent
-        rate = f"{short(100 * mean)}\u00a0%" if in_percent else short(mean)
-        rate = count_of(mean, n) or rate
-    censored = (run.summary.get("censoring") or {}).get(key) or {}
-    cut_steps = [censored.get(name) or 0 for name in ("steps_after_event", "steps_after_drift")]
-    mean_ms = finite(((run.summary.get("speed") or {}).get(key) or {}).get("ms_per_frame_mean"))
-    median_m = finite(entry.get(f"{DISTANCE}_median"))
-    # The failures of a variant by their ending, the gravest first.
-    places: dict[str, list[str]] = {}
-    for metric, facts in entry["outcomes"].items():
-        outcome = OUTCOMES[metric]
-        for cell in facts["cells"]:
-            seed = f" seed {cell['seed']}" if cell["seed"] else ""
-            when = "" if cell["t_s"] is None else f" at {cell['t_s']:.1f}\u00a0s"
-            ending = places.setdefault(outcome.ending or outcome.words, [])
-            ending.append(f"{cell['scene']}{seed}{when}")
+    key = variant if variant in summary.metrics else renderer
+    is_cut_short = False
+    if key in summary.censoring:
+        ledger = summary.censoring[key]
+        is_cut_short = ledger.steps_after_event > 0 or ledger.steps_after_drift > 0
+    mean_ms = summary.speed[key].ms_per_frame_mean if key in summary.speed else None
+    median_m = entry.lateral_distance_m_median
     return VariantRow(
         key,
         variant_name(run, variant),
-        entry["endings"],
-        rate,
+        entry.endings,
+        _rate_text(run, summary.metrics.get(key, {}).get(run.table.primary)),
         differences.get(key),
         DASH if median_m is None else fixed(median_m, 2),
-        median_m is not None and sum(cut_steps) > 0,
+        median_m is not None and is_cut_short,
         DASH if mean_ms is None else fixed(mean_ms, 0 if mean_ms >= 10 else 1),
-        places,
+        _places_of(entry),
     )
+
+
+def _rate_text(run: Run, primary: Mean | None) -> str:
+    """Print a variant's primary metric, as a count where it is one."""
+    if primary is None or primary.mean is None:
+        return DASH
+    rate = short(primary.mean)
+    if run.table.shown(run.table.primary).in_percent:
+        rate = f"{short(100 * primary.mean)}\u00a0%"
+    return count_of(primary.mean, primary.n_rollouts) or rate
+
+
+def _places_of(entry: Endings) -> dict[str, list[str]]:
+    """Return the failures of a variant by their ending, the gravest first."""
+    places: dict[str, list[str]] = {}
+    for metric, events in entry.outcomes.items():
+        outcome = OUTCOMES[metric]
+        for cell in events.cells:
+            seed = f" seed {cell.seed}" if cell.seed else ""
+            when = "" if cell.t_s is None else f" at {cell.t_s:.1f}\u00a0s"
+            ending = places.setdefault(outcome.ending or outcome.words, [])
+            ending.append(f"{cell.scene}{seed}{when}")
+    return places

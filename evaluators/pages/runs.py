@@ -4,7 +4,7 @@ found below a folder.
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,13 +18,12 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.core.files.lock import is_locked
-from alpasim_plugin.core.files.reading import read_json_as
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
-from alpasim_plugin.log.run_folder.shapes import Summary
 from evaluators.metrics import MetricTable
-from evaluators.statistics.numbers import DASH, finite, interval, printed
+from evaluators.results import Mean, Summary, read_summary
+from evaluators.statistics.numbers import DASH, printed
 
 CHECK = "simrun check run RUN says what is damaged"
 
@@ -45,14 +44,14 @@ class RunEntry:
             any more; ``damaged`` where it cannot be read.
         problem: Why it is damaged, else empty.
         info: ``run.json``; empty where it cannot be read.
-        summary: ``summary.json``; empty where the run is not finished.
+        summary: ``summary.json``; None where the run is not finished.
     """
 
     folder: Path
     state: State
     problem: str
     info: JsonView
-    summary: JsonView
+    summary: Summary | None
 
     @property
     def started_at(self) -> datetime:
@@ -87,14 +86,13 @@ class RunEntry:
             for renderer in self.info.get("renderers") or ()
         ]
 
-    def metric(self, metric: str, renderer: str, policy: str) -> JsonView:
-        """Return the entry of a metric in ``summary.json``; empty where it has none."""
-        table = self.summary.get("metrics") or {}
-        alone = renderer if len(self.info.get("policies") or ()) == 1 else ""
-        entries: Mapping[str, JsonView] = (
-            table.get(cell_name(renderer, policy)) or table.get(alone) or {}
-        )
-        return entries.get(metric) or {}
+    def metric(self, metric: str, renderer: str, policy: str) -> Mean | None:
+        """Return the mean of a metric in ``summary.json``; None where it has none."""
+        if self.summary is None:
+            return None
+        is_alone = len(self.info["policies"]) == 1
+        variant = renderer if is_alone else cell_name(renderer, policy)
+        return self.summary.metrics.get(variant, {}).get(metric)
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything for JSON."""
@@ -124,14 +122,14 @@ def read_entry(folder: Path) -> RunEntry:
     try:
         info = read_run_json(folder)
         if not os.path.isfile(folder / SUMMARY):
-            return RunEntry(folder, "running" if is_running else "unfinished", "", info, {})
+            return RunEntry(folder, "running" if is_running else "unfinished", "", info, None)
         if not os.path.isfile(folder / ROLLOUTS):
-            return RunEntry(folder, "damaged", f"{ROLLOUTS}: missing", info, {})
-        summary: JsonView = read_json_as(Summary, folder / SUMMARY, do_this=CHECK)
+            return RunEntry(folder, "damaged", f"{ROLLOUTS}: missing", info, None)
+        summary = read_summary(folder / SUMMARY, CHECK)
     except InputError as error:
         if is_running:
-            return RunEntry(folder, "running", "", info, {})
-        return RunEntry(folder, "damaged", error.message, info, {})
+            return RunEntry(folder, "running", "", info, None)
+        return RunEntry(folder, "damaged", error.message, info, None)
     return RunEntry(folder, "finished", "", info, summary)
 
 
@@ -213,13 +211,12 @@ def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
     """Print a metric's mean with its 95 % interval over scenes, both as `summary.json` has them; a
     dash where there is no mean.
     """
-    numbers = entry.metric(metric, renderer, policy)
-    mean = finite(numbers.get("mean"))
-    if mean is None:
+    mean = entry.metric(metric, renderer, policy)
+    if mean is None or mean.mean is None:
         return DASH
     facts = MetricTable.of_run(entry.info).shown(metric)
-    unit = "%" if facts.in_percent else str(numbers.get("unit") or "")
-    texts = printed(facts, mean, *(interval(numbers.get("ci95_clustered")) or ()))
+    unit = "%" if facts.in_percent else mean.unit
+    texts = printed(facts, mean.mean, *(mean.ci95_clustered or ()))
     spread = f"({' to '.join(texts[1:])})" if len(texts) > 1 else ""
     return " ".join(filter(None, (texts[0], unit, spread)))
 

@@ -1,12 +1,11 @@
 """Turn a run into table rows: text, order and hover text, without markup."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.log.run_folder.shapes import pair_tables
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.pages.overview import tone_of
+from evaluators.results import Difference, Mean, Summary
 from evaluators.statistics.numbers import (
     ARROW_WORDS,
     ARROWS,
@@ -15,9 +14,7 @@ from evaluators.statistics.numbers import (
     Cell,
     count_of,
     decimals,
-    finite,
     fixed,
-    interval,
     missing,
     plural,
     printed,
@@ -65,31 +62,25 @@ class PairRow:
 
 
 def metric_rows(
-    summary: JsonView,
+    summary: Summary,
     reasons: Mapping[tuple[str, str], str] | None = None,
     known: MetricTable = METRICS,
 ) -> list[MetricRow]:
-    """Lay out metrics x variants from ``summary.json``.
+    """Lay out metrics x variants.
 
     Args:
-        summary: Content of ``summary.json``.
+        summary: The results of a run.
         reasons: (renderer, metric) -> why it is invalid, for cells without a number.
         known: What the metrics are.
     """
-    variants = summary.get("metrics") or {}
+    variants = summary.metrics
     rows = []
     for name in known.ordered(metric for metrics in variants.values() for metric in metrics):
         facts = known.shown(name)
-        entries = {variant: metrics.get(name) or {} for variant, metrics in variants.items()}
-        unit = next((str(entry["unit"]) for entry in entries.values() if entry.get("unit")), "")
-        directions = [str(entry["direction"]) for entry in entries.values() if "direction" in entry]
-        direction = directions[0] if directions else "none"
-        places = 1
-        if not facts.in_percent:
-            means = [finite(entry.get("mean")) for entry in entries.values()]
-            bounds = [interval(entry.get("ci95_clustered")) for entry in entries.values()]
-            halves = [(ends[1] - ends[0]) / 2 for ends in bounds if ends]
-            places = max(decimals(*means), decimals(*halves, digits=2) if halves else 0)
+        entries = {variant: metrics.get(name) for variant, metrics in variants.items()}
+        means = [entry for entry in entries.values() if entry is not None]
+        direction = means[0].direction
+        places = 1 if facts.in_percent else _places(means)
         cells = (
             metric_cell(facts, entry, places, (reasons or {}).get((variant, name), ""))
             for variant, entry in entries.items()
@@ -98,7 +89,7 @@ def metric_rows(
             MetricRow(
                 name=name,
                 meaning=facts.help,
-                unit="%" if facts.in_percent else unit,
+                unit="%" if facts.in_percent else means[0].unit,
                 arrow=ARROWS.get(direction, ""),
                 arrow_word=ARROW_WORDS.get(direction, "neither direction is better"),
                 cells=tuple(cells),
@@ -108,88 +99,112 @@ def metric_rows(
     return rows
 
 
-def metric_cell(metric: MetricInfo, entry: JsonView, places: int, reason: str) -> Cell:
+def _places(means: Sequence[Mean]) -> int:
+    """Return how many decimals show three digits of the means and two of their intervals."""
+    halves = [
+        (mean.ci95_clustered[1] - mean.ci95_clustered[0]) / 2
+        for mean in means
+        if mean.ci95_clustered is not None
+    ]
+    places = decimals(*(mean.mean for mean in means))
+    return max(places, decimals(*halves, digits=2)) if halves else places
+
+
+def metric_cell(metric: MetricInfo, entry: Mean | None, places: int, reason: str) -> Cell:
     """Print a mean with its interval, scenes as clusters, and for rates the count."""
-    mean = finite(entry.get("mean"))
+    if entry is None:
+        return missing(reason or "not computed for this renderer")
+    mean = entry.mean
     if mean is None:
-        absent = "valid in no rollout" if entry else "not computed for this renderer"
-        return missing(reason or str(entry.get("reason") or absent))
-    n_rollouts = int(entry.get("n_rollouts") or 0)
-    notes = [f"{plural(n_rollouts, 'rollout')}, {plural(int(entry.get('n_scenes') or 0), 'scene')}"]
-    if entry.get("n_invalid"):
-        notes.append(f"invalid in {entry['n_invalid']} more" + (f" ({reason})" if reason else ""))
-    if entry.get("note"):
-        notes.append(str(entry["note"]))
+        return missing(reason or entry.reason or "valid in no rollout")
+    notes = [f"{plural(entry.n_rollouts, 'rollout')}, {plural(entry.n_scenes, 'scene')}"]
+    if entry.n_invalid:
+        notes.append(f"invalid in {entry.n_invalid} more" + (f" ({reason})" if reason else ""))
+    if entry.note:
+        notes.append(entry.note)
     scale = 100.0 if metric.in_percent else 1.0
-    bounds = interval(entry.get("ci95_clustered"))
+    bounds = entry.ci95_clustered
     detail = DASH
     if bounds is None:
-        why = entry.get("ci95_clustered_reason") or "it needs at least two scenes"
+        why = entry.ci95_clustered_reason or "it needs at least two scenes"
         notes.append(f"no interval over scenes: {why}")
     else:
         detail = " to ".join(fixed(bound * scale, places) for bound in bounds)
-    counted = count_of(mean, n_rollouts) if metric.is_flag else ""
+    counted = count_of(mean, entry.n_rollouts) if metric.is_flag else ""
     if counted:
         percent = f"{NARROW}%" if bounds else ""
         detail = f"{counted.replace(' of ', '/')} ({detail}{percent})"
         if mean == 0.0 and bounds:
             most = fixed(bounds[1] * scale, places)
-            notes.append(f"no event in {n_rollouts}: only rates above {most} % are excluded")
+            notes.append(f"no event in {entry.n_rollouts}: only rates above {most} % are excluded")
     return Cell(fixed(mean * scale, places), "; ".join(notes), detail, mean)
 
 
-def pair_rows(summary: JsonView, known: MetricTable = METRICS) -> list[PairRow]:
-    """Lay out the paired differences, headline metrics first within each variant; those with a
-    fixer's own base come last.
+def pair_rows(
+    differences: Sequence[tuple[str, Mapping[str, Difference]]], known: MetricTable = METRICS
+) -> list[PairRow]:
+    """Lay out paired differences, headline metrics first within each variant.
+
+    Args:
+        differences: Variants with METRIC -> difference, in the order of the table
+            (`evaluators.results.Summary.differences`).
+        known: What the metrics are.
     """
-    rows = []
-    for variant, pairs in pair_tables(summary):
-        rows += [
-            _pair_row(variant, known.shown(name), pairs[name]) for name in known.ordered(pairs)
-        ]
-    return rows
+    return [
+        _pair_row(variant, known.shown(name), pairs[name])
+        for variant, pairs in differences
+        for name in known.ordered(pairs)
+    ]
 
 
-def _pair_row(variant: str, metric: MetricInfo, entry: JsonView) -> PairRow:
-    difference = finite(entry.get("diff"))
-    p = finite(entry.get("p_value"))
-    bounds = interval(entry.get("ci95")) or ()
-    scale, unit = scale_and_unit(metric, str(entry.get("unit", "")))
-    counts = [(entry.get("n_cells"), "pair"), (entry.get("n_scenes"), "scene")]
-    numbers = [plural(int(count), noun) for count, noun in counts if count is not None]
-    if entry.get("n_missing"):
-        numbers.append(f"{entry['n_missing']} rollouts lack a partner")
-    reason = str(entry.get("reason") or "")
+def _pair_row(variant: str, metric: MetricInfo, entry: Difference) -> PairRow:
+    bounds = entry.ci95 or ()
+    scale, unit = scale_and_unit(metric, entry.unit)
+    numbers = [plural(entry.n_cells, "pair"), plural(entry.n_scenes, "scene")]
+    if entry.n_missing:
+        numbers.append(f"{entry.n_missing} rollouts lack a partner")
     note = ", ".join(numbers)
-    diff_cell = missing(reason or "no pair has this metric valid on both sides")
-    bounds_cell = missing(reason or "it needs at least two scenes")
-    if difference is not None:
-        texts = printed(metric, difference, *bounds, sign=True)
-        diff_cell = Cell(f"{texts[0]}\u00a0{unit}".strip("\u00a0"), note, sort=scale * difference)
+    diff_cell = missing(entry.reason or "no pair has this metric valid on both sides")
+    bounds_cell = missing(entry.reason or "it needs at least two scenes")
+    if entry.diff is not None:
+        texts = printed(metric, entry.diff, *bounds, sign=True)
+        diff_cell = Cell(f"{texts[0]}\u00a0{unit}".strip("\u00a0"), note, sort=scale * entry.diff)
         if bounds:
             bounds_cell = Cell(" to ".join(texts[1:]), note, sort=scale * (bounds[1] - bounds[0]))
-    p_cell = missing(reason or "no test was made")
-    if p is not None:
-        text = "< 0.001" if p < 0.001 else fixed(p, 3)
-        p_cell = Cell(text, str(entry.get("test") or ""), sort=p)
-    tone = tone_of(entry)
-    verdict = str(entry.get("verdict"))
-    margin = finite(entry.get("margin"))
     hint = ""
-    if margin is not None and entry.get("direction") != "none":
-        hint = f"margin {short(margin * scale, unit)}"
+    if entry.direction != "none":
+        hint = f"margin {short(entry.margin * scale, unit)}"
     return PairRow(
         variant,
-        str(entry.get("baseline") or DASH),
+        entry.baseline,
         metric.name,
         metric.help,
         diff_cell,
         bounds_cell,
-        p_cell,
-        VERDICT_WORDS.get((verdict, str(entry.get("difference"))), verdict),
-        tone,
+        _p_cell(entry),
+        verdict_words(entry),
+        tone_of(entry),
         hint,
     )
+
+
+def _p_cell(entry: Difference) -> Cell:
+    """Print the p-value that the verdict goes by, and on hover the one before the correction."""
+    if entry.p_value is None or entry.p_corrected is None:
+        return missing(entry.reason or "no test was made")
+    note = f"{entry.test}; by itself p = {_p_text(entry.p_value)}"
+    return Cell(_p_text(entry.p_corrected), note, sort=entry.p_corrected)
+
+
+def _p_text(p: float) -> str:
+    return "< 0.001" if p < 0.001 else fixed(p, 3)
+
+
+def verdict_words(entry: Difference) -> str:
+    """Say the verdict on other scenes, and what is shown on these."""
+    if entry.difference is None:
+        return entry.verdict
+    return VERDICT_WORDS.get((entry.verdict, entry.difference), entry.verdict)
 
 
 @dataclass(frozen=True)

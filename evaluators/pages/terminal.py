@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from alpasim_plugin.core.escape import terminal as escape
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.metrics.outcomes import outcomes_of
@@ -20,6 +19,7 @@ from evaluators.metrics.score_table import SCORES
 from evaluators.pages.flips import find_flips
 from evaluators.pages.overview import TONES, Overview
 from evaluators.pages.tables import metric_rows
+from evaluators.results import Summary
 from evaluators.statistics.numbers import labelled
 from evaluators.statistics.opening import Run
 
@@ -30,18 +30,18 @@ LEAST_PLOT = 20  # letters
 MARGIN_NOTE = "a to b: 95 %, scenes as clusters"
 
 
-def render_presets(summaries: Mapping[str, JsonView]) -> Table:
+def render_presets(summaries: Mapping[str, Summary]) -> Table:
     """Lay out the scores of several presets on the same logs: a benchmark's own scores, of the
     other presets their headline metrics.
 
     Args:
-        summaries: Preset -> content of its ``summary.json``.
+        summaries: Preset -> its results.
 
     A score that is not measured in every rollout shows the range of its mean, and what is missing.
     """
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     columns = list(
-        dict.fromkeys(variant for one in summaries.values() for variant in one.get("metrics") or {})
+        dict.fromkeys(variant for summary in summaries.values() for variant in summary.metrics)
     )
     for head in ("preset", "score", *columns):
         table.add_column(Text(escape(head)), overflow="fold")
@@ -58,30 +58,36 @@ def render_presets(summaries: Mapping[str, JsonView]) -> Table:
     return table
 
 
-def _score_cell(summary: JsonView, variant: str, name: str, in_percent: bool) -> Text:
-    metrics = (summary.get("metrics") or {}).get(variant) or {}
-    invalid = ((summary.get("censoring") or {}).get(variant) or {}).get("invalid") or {}
-    reasons = "; ".join((invalid.get(name) or {}).get("reasons") or ())
-    mean, least, most = (
-        "" if value is None else f"{100 * value:.1f} %" if in_percent else f"{value:.3f}"
-        for value in (
-            (metrics.get(name + end) or {}).get("mean") for end in ("", "_least", "_most")
-        )
-    )
-    number = f"{least} to {most}" if reasons and least else mean
-    note = reasons or ("" if mean else "not measured")
+def _score_cell(summary: Summary, variant: str, name: str, in_percent: bool) -> Text:
+    means = summary.metrics.get(variant, {})
+
+    def text_of(metric: str) -> str:
+        mean = means[metric].mean if metric in means else None
+        if mean is None:
+            return ""
+        return f"{100 * mean:.1f} %" if in_percent else f"{mean:.3f}"
+
+    ledger = summary.censoring.get(variant)
+    reasons = ""
+    if ledger is not None and name in ledger.invalid:
+        reasons = "; ".join(ledger.invalid[name].reasons)
+    number = text_of(name)
+    note = reasons or ("" if number else "not measured")
+    least = text_of(f"{name}_least")
+    if reasons and least:
+        number = f"{least} to {text_of(f'{name}_most')}"
     return Text(f"{number} ").append(escape(note), style="dim")
 
 
-def metric_lines(summary: JsonView, known: MetricTable = METRICS) -> list[str]:
+def metric_lines(summary: Summary, known: MetricTable = METRICS) -> list[str]:
     """Print the mean and 95 % interval of each metric, a line a variant.
 
     Args:
-        summary: Content of ``summary.json``.
+        summary: The results of a run.
         known: What the metrics are.
     """
     rows = metric_rows(summary, known=known)
-    names = [escape(name) for name in summary.get("metrics") or {}]
+    names = [escape(name) for name in summary.metrics]
     width = max(map(len, names), default=0)
     lines = []
     for row in rows:
@@ -97,7 +103,7 @@ def metric_lines(summary: JsonView, known: MetricTable = METRICS) -> list[str]:
     if rows:
         lines.append(MARGIN_NOTE)
         if any(row.name.startswith("collision") for row in rows):
-            lines.append(contact_note(str(summary.get("preset"))))
+            lines.append(contact_note(summary.preset))
     return [line.rstrip() for line in lines if line]
 
 

@@ -1,13 +1,17 @@
 """Paired differences within a run, or between two runs on the rollouts that both have."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS, MetricTable
+from evaluators.results import DifferenceTable
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
 from evaluators.statistics.opening import Run
-from evaluators.statistics.paired import Pair, Table, compare_pairs, pairs_within
+from evaluators.statistics.paired import BLOCKS, Pair, compare_pairs, pairs_within
 from evaluators.statistics.variants import Base, Variant, base_named, choices, variants_in
+
+NO_PAIRS: Sequence[Pair] = ()
 
 
 @dataclass(frozen=True)
@@ -15,22 +19,22 @@ class Comparison:
     """Paired differences.
 
     Attributes:
-        paired: VARIANT -> METRIC -> what `statistics.paired.compare` gives; a variant is RENDERER,
-            or RENDERER/POLICY where there are several policies.
+        paired: VARIANT -> METRIC -> difference; a variant is RENDERER, or RENDERER/POLICY where
+            there are several policies.
+        paired_with_base: The same of renderers with a fixer against the renderer below it, where
+            that is not the baseline.
+        paired_policies: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty
+            where one variant is the baseline of all.
         notes: What a reader must know, such as policies that were paired although their names
             differ.
-        with_base: The same of renderers with a fixer against the renderer below it, where that is
-            not the baseline.
         metrics: What the metrics are.
-        policies: The same of policies behind one renderer, RENDERER/POLICY -> METRIC; empty where
-            one variant is the baseline of all.
     """
 
-    paired: Table
+    paired: DifferenceTable
+    paired_with_base: DifferenceTable = field(default_factory=dict)
+    paired_policies: DifferenceTable = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    with_base: Table = field(default_factory=dict)
     metrics: MetricTable = field(default_factory=lambda: METRICS)
-    policies: Table = field(default_factory=dict)
 
 
 def compare_within(
@@ -60,22 +64,23 @@ def compare_within(
             "name a second run, or run two renderers or two policies",
         )
     if base is not None and base.policy is not None:
+        blocks: dict[str, Sequence[Pair]]
         pairs = [Pair(own.name, own, other, other.name) for own, other in base.pairs(variants)]
-        blocks = [pairs, [], []]
+        blocks = dict.fromkeys(BLOCKS, NO_PAIRS) | {BLOCKS[0]: pairs}
     else:
         own_baseline = (run.info.get("config") or {}).get("baseline")
-        blocks = pairs_within(table, baseline or own_baseline, run.info.get("bases") or {})
+        blocks = {**pairs_within(table, baseline or own_baseline, run.info.get("bases") or {})}
         if baseline is not None:
-            blocks = [[pair for pair in blocks[0] if pair.baseline == baseline], [], []]
+            named = [pair for pair in blocks[BLOCKS[0]] if pair.baseline == baseline]
+            blocks = dict.fromkeys(BLOCKS, NO_PAIRS) | {BLOCKS[0]: named}
             if len(table.renderers) == 1:
                 raise InputError(
                     f"{run.folder}: only one renderer, {baseline}",
                     f"choose one of {', '.join(choices(variants))}",
                 )
-    paired, with_base, policies = (
-        compare_pairs(table, pairs, run.table, listed=listed) for pairs in blocks
-    )
-    return Comparison(paired, (), with_base, run.table, policies)
+    tables = compare_pairs(table, blocks, run.table, listed=listed)
+    paired, with_base, of_policies = (tables[block] for block in BLOCKS)
+    return Comparison(paired, with_base, of_policies, metrics=run.table)
 
 
 def compare_runs(
@@ -96,7 +101,7 @@ def compare_runs(
             policy has no partner, or a metric is another quantity in the other run.
     """
     both = f"{first.folder} and {second.folder}"
-    presets = [str(run.summary.get("preset")) for run in (first, second)]
+    presets = [run.summary.preset for run in (first, second)]
     if presets[0] != presets[1]:
         raise InputError(
             f"{both}: presets {presets[0]!r} and {presets[1]!r}",
@@ -148,5 +153,5 @@ def compare_runs(
             f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
         )
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
-    paired = compare_pairs(table, pairs, metrics, base, listed)
-    return Comparison(paired, notes, metrics=metrics)
+    tables = compare_pairs(table, {BLOCKS[0]: pairs}, metrics, base, listed)
+    return Comparison(tables[BLOCKS[0]], notes=notes, metrics=metrics)

@@ -197,4 +197,4 @@ def scene_hashes(run: Run) -> dict[str, str]:
 
 
 def _preset(run: Run) -> str:
-    return str(run.summary.get("preset") or run.info.get("preset") or "")
+    return run.summary.preset

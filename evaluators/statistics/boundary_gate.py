@@ -5,10 +5,11 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable
+from evaluators.results import Cause, Outcome
 from evaluators.statistics.gate import Check, GateSpec, GateVerdict, failures_of
 from evaluators.statistics.numbers import fixed
 from evaluators.statistics.variants import base_named, short_name, usual_base, variants_in
-from evaluators.statistics.verdicts import Cause, Outcome, outcome_of_failures, worst
+from evaluators.statistics.verdicts import outcome_of_failures, worst
 
 METRIC = "boundary"
 

@@ -31,6 +31,7 @@ from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.metrics import METRICS
+from evaluators.results import Cause, Outcome
 from evaluators.statistics.betting import (
     Draws,
     Plan,
@@ -39,7 +40,6 @@ from evaluators.statistics.betting import (
     lower_bound,
 )
 from evaluators.statistics.paired import Pairs, reach_of
-from evaluators.statistics.verdicts import Cause, Outcome
 
 Answer = Literal["good", "bad", "open"]
 

@@ -23,6 +23,7 @@ from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
+from evaluators.results import Cause, Failures, Outcome, Verdict, to_json
 from evaluators.statistics.numbers import plural, short
 from evaluators.statistics.paired import compare, least_scenes
 from evaluators.statistics.sentences import change_text, difference_text
@@ -45,12 +46,7 @@ from evaluators.statistics.variants import (
     short_name,
     usual_base,
 )
-from evaluators.statistics.verdicts import (
-    Cause,
-    Outcome,
-    outcome_of_failures,
-    worst,
-)
+from evaluators.statistics.verdicts import outcome_of_failures, worst
 
 LIBRARY = Path(__file__).resolve().parents[2] / "configs" / "gates"
 
@@ -212,7 +208,11 @@ SUITE = {
     False: "about these scenes; the policy is not repeatable: events by exact tests over seeds, other metrics by the mean of drives cut at three margins",
     None: "about these scenes and seeds; run --repeat has not tried whether the policy is repeatable",
 }
-CAUSES: dict[str, Cause] = {"non-inferior": "pass", "worse": "regression", "undecided": "undecided"}
+CAUSES: dict[Verdict, Cause] = {
+    "non-inferior": "pass",
+    "worse": "regression",
+    "undecided": "undecided",
+}
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class GateVerdict:
 
     outcome: Outcome
     checks: tuple[Check, ...]
-    failures: JsonView
+    failures: Failures
     baseline: str  # what was compared with, in words
     about: str  # what it is about, in words
     accepts_failures: bool = False  # rollouts failed, and no more than the gate accepts
@@ -252,7 +252,11 @@ class GateVerdict:
             "outcome": self.outcome.as_dict(),
             "baseline": self.baseline,
             "about": self.about,
-            "failures": dict(self.failures),
+            "failures": {
+                "n_rollouts": self.failures.n_rollouts,
+                "n_failed": self.failures.n_failed,
+                "by_class": self.failures.by_class,
+            },
             "checks": checks,
         }
 
@@ -345,11 +349,10 @@ def _sides(table: RolloutTable) -> Sides:
     }
 
 
-def failures_of(table: RolloutTable) -> JsonObject:
+def failures_of(table: RolloutTable) -> Failures:
     """Count rollouts that did not run to their end, as summary.json does."""
     by_class = table.failures()
-    n_failed = sum(by_class.values())
-    return {"n_rollouts": table.n_rollouts, "n_failed": n_failed, "by_class": by_class}
+    return Failures(sum(by_class.values()), table.n_rollouts, by_class)
 
 
 def _tested_variants(
@@ -448,13 +451,14 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
         metric = known.info(name)
         margin = rule.margin_of(metric)
         entry = compare(pair.side, pair.base, metric, pair.label, margin)
-        cause = CAUSES[entry["verdict"]]
+        cause = CAUSES[entry.verdict]
         binding = rule.must_decide or cause == "regression"
-        if entry["n_missing"] > spec.max_missing * (entry["n_cells"] + entry["n_missing"]):
+        if entry.n_missing > spec.max_missing * (entry.n_cells + entry.n_missing):
             cause = "incomplete"
-        text = f"{difference_text(entry, metric)}: {entry['verdict']}"
-        entry["worst"] = change_of(pair.side, pair.base, metric, margin, ()).worst()
-        checks.append(pair.check(metric, cause, text, entry, binding))
+        text = f"{difference_text(entry, metric)}: {entry.verdict}"
+        worst_cells = change_of(pair.side, pair.base, metric, margin, ()).worst()
+        facts = to_json(entry) | {"worst": worst_cells}
+        checks.append(pair.check(metric, cause, text, facts, binding))
     return checks
 
 
@@ -561,7 +565,7 @@ def _suite_check(
             for (_, scene, seed), is_cut in zip(change.side.cells, change.is_cut, strict=True)
             if is_cut
         ],
-        "missing": change.missing[:LISTED],
+        "missing": [to_json(missing) for missing in change.missing[:LISTED]],
         "seeds": seeds_that_decide(change) if verdict == "undecided" else None,
     }
     text = change_text(entry, metric)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import KEYS
 from evaluators.metrics.outcomes import (
@@ -18,6 +18,7 @@ from evaluators.metrics.outcomes import (
     reached_end,
     told,
 )
+from evaluators.results import Endings, EventCount, EventPlace
 
 Times = Mapping[
     tuple[str, str, str, int], Mapping[str, float]
@@ -39,7 +40,7 @@ def times_of(manifests: Iterable[JsonView]) -> Times:
     return times
 
 
-def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, JsonObject]:
+def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, Endings]:
     """Count outcomes by variant.
 
     Args:
@@ -47,11 +48,7 @@ def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> di
         times: When outcomes began, as far as it is known.
 
     Returns:
-        RENDERER/POLICY -> ``n_rollouts``; ``n_ended`` (ran to their end, or were broken by the
-        policy); ``n_failed`` (of these: with an outcome); ``n_reached_end`` (without one, at the
-        end of the path); ``outcomes``: NAME -> ``n`` and ``cells`` (the first `LISTED`: ``scene``,
-        ``seed``, ``t_s`` or None); ``endings``: the one way in which each rollout ended, counted;
-        ``lateral_distance_m_median`` over rollouts, None without a value.
+        RENDERER/POLICY -> how its rollouts ended; of each outcome the first `LISTED` are named.
     """
     variants: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
@@ -59,27 +56,26 @@ def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> di
     return {name: _of_variant(own, times or {}) for name, own in variants.items()}
 
 
-def _of_variant(rollouts: Sequence[Rollout], times: Times) -> JsonObject:
+def _of_variant(rollouts: Sequence[Rollout], times: Times) -> Endings:
     ended = [r for r in rollouts if has_ended(r)]
-    known = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
-    endings = Counter(map(ending_of, rollouts))
-    cells: dict[str, list[JsonObject]] = {}
+    distances = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
+    counts = Counter(map(ending_of, rollouts))
+    places: dict[str, list[EventPlace]] = {}
     for rollout in ended:
         began = times.get(rollout.cell, {})
         for outcome in told(outcomes_of(rollout)):
-            cells.setdefault(outcome.name, []).append(
-                {"scene": rollout.scene, "seed": rollout.seed, "t_s": began.get(outcome.name)}
-            )
-    return {
-        "n_rollouts": len(rollouts),
-        "n_ended": len(ended),
-        "n_failed": sum(bool(outcomes_of(r)) for r in ended),
-        "n_reached_end": sum(reached_end(r) for r in ended),
-        "endings": {name: endings[name] for name in ENDINGS if name in endings},
-        f"{DISTANCE}_median": float(np.median(known)) if known else None,
-        "outcomes": {
-            name: {"n": len(cells[name]), "cells": cells[name][:LISTED]}
+            place = EventPlace(rollout.scene, rollout.seed, began.get(outcome.name))
+            places.setdefault(outcome.name, []).append(place)
+    return Endings(
+        n_rollouts=len(rollouts),
+        n_ended=len(ended),
+        n_failed=sum(bool(outcomes_of(r)) for r in ended),
+        n_reached_end=sum(reached_end(r) for r in ended),
+        endings={name: counts[name] for name in ENDINGS if name in counts},
+        outcomes={
+            name: EventCount(len(places[name]), tuple(places[name][:LISTED]))
             for name in OUTCOMES
-            if name in cells
+            if name in places
         },
-    }
+        lateral_distance_m_median=float(np.median(distances)) if distances else None,
+    )

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.sides import (
     Cell,
@@ -26,6 +26,16 @@ from alpasim_plugin.log.run_folder.sides import (
     metric_names,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.results import (
+    Beyond,
+    Bounds,
+    CellCounts,
+    Difference,
+    DifferenceTable,
+    MissingPair,
+    SceneCounts,
+    Verdict,
+)
 from evaluators.statistics.bounded import mean_bounds, upper_bound
 from evaluators.statistics.intervals import (
     FEW_SCENES,
@@ -47,6 +57,7 @@ from evaluators.statistics.verdicts import (
     LEAST_SCENES,
     MOST_SCENES,
     REACH,
+    corrected,
     difference,
     harm,
     more_scenes,
@@ -56,8 +67,7 @@ from evaluators.statistics.verdicts import (
     verdict,
 )
 
-Table = dict[str, dict[str, JsonObject]]  # RENDERER -> METRIC -> numbers
-
+BLOCKS = ("paired", "paired_with_base", "paired_policies")  # tables of a summary
 LISTED = 50  # missing cells named per metric; the count is always whole
 NO_PAIR = "no scene and seed has this metric on both sides"
 
@@ -75,8 +85,9 @@ def paired(
     rows: Sequence[Row],
     baseline: str,
     listed: int = LISTED,
-) -> Table:
-    """Compare every renderer with a baseline, cell by cell.
+) -> DifferenceTable:
+    """Compare every renderer with a baseline, cell by cell; verdicts are corrected for the number
+    of comparisons (`evaluators.statistics.verdicts.corrected`).
 
     Args:
         rows: As for `aggregate`.
@@ -84,7 +95,7 @@ def paired(
         listed: How many missing cells to name per metric.
 
     Returns:
-        RENDERER -> METRIC -> what `compare` gives.
+        RENDERER -> METRIC -> difference.
 
     Raises:
         InputError: No row has the baseline.
@@ -95,21 +106,22 @@ def paired(
             f"baseline {baseline!r}: no rollout has it",
             f"choose one of {', '.join(sides)}",
         )
-    return {
+    table = {
         renderer: {
-            name: compare(side, sides[baseline], METRICS.info(name), baseline, listed=listed)
+            name: measure(side, sides[baseline], METRICS.info(name), baseline, listed=listed)
             for name in metric_names(rows)
         }
         for renderer, side in sides.items()
         if renderer != baseline
     }
+    return decided_together({"paired": table}, METRICS)["paired"]
 
 
 def pairs_within(
     table: RolloutTable, baseline: str | None, bases: Mapping[str, str]
-) -> list[list[Pair]]:
-    """Return what is compared within a run: renderers with a baseline, fixers with the renderer
-    below them, and policies with one policy.
+) -> dict[str, list[Pair]]:
+    """Return what is compared within a run, by the names of `BLOCKS`: renderers with a baseline,
+    fixers with the renderer below them, and policies with one policy.
 
     Args:
         table: The rollouts.
@@ -143,40 +155,71 @@ def pairs_within(
             Pair(variant.name, variant, partner, partner.name)
             for variant, partner in by_policy_base.pairs(variants)
         ]
-    return [of_renderers, of_fixers, of_policies]
+    return dict(zip(BLOCKS, (of_renderers, of_fixers, of_policies), strict=True))
 
 
 def compare_pairs(
     table: RolloutTable,
-    pairs: Sequence[Pair],
+    blocks: Mapping[str, Sequence[Pair]],
     known: MetricTable,
     base: RolloutTable | None = None,
     listed: int = LISTED,
-) -> Table:
+) -> dict[str, DifferenceTable]:
     """Compare variants with variants, scene by scene and seed by seed; their policies may differ.
+    Verdicts are corrected for the number of comparisons in all blocks.
 
     Args:
         table: The rollouts of the first variant of each pair.
-        pairs: What is compared.
+        blocks: What is compared.
         known: What the metrics are.
         base: The rollouts of the second variant of each pair; None: the same table.
         listed: How many missing cells to name per metric.
 
     Returns:
-        The pair's key -> METRIC -> what `compare` gives.
+        BLOCK -> the pair's key -> METRIC -> difference.
     """
     sides = cache(table.sides)
     base_sides = sides if base is None else cache(base.sides)
     names = dict.fromkeys([*table.metrics, *(base or table).metrics])
-    out: Table = {}
-    for key, variant, other, baseline in pairs:
-        side = sides(variant.policy, variant.policy)[variant.renderer]
-        base_side = base_sides(other.policy, variant.policy)[other.renderer]
-        out[key] = {
-            name: compare(side, base_side, known.info(name), baseline, listed=listed)
-            for name in names
+    measured: dict[str, DifferenceTable] = {}
+    for block, pairs in blocks.items():
+        measured[block] = {}
+        for key, variant, other, baseline in pairs:
+            side = sides(variant.policy, variant.policy)[variant.renderer]
+            base_side = base_sides(other.policy, variant.policy)[other.renderer]
+            measured[block][key] = {
+                name: measure(side, base_side, known.info(name), baseline, listed=listed)
+                for name in names
+            }
+    return decided_together(measured, known)
+
+
+def decided_together(
+    measured: Mapping[str, DifferenceTable], known: MetricTable
+) -> dict[str, DifferenceTable]:
+    """Decide about differences that are read together, with Holm's correction for their number.
+
+    Args:
+        measured: BLOCK -> VARIANT -> METRIC -> what `measure` gave.
+        known: What the metrics are.
+    """
+    p_values = {
+        (block, variant, name): entry.p_value
+        for block, table in measured.items()
+        for variant, entries in table.items()
+        for name, entry in entries.items()
+    }
+    p_corrected = corrected(p_values, known.primary)
+    return {
+        block: {
+            variant: {
+                name: decide(entry, known.info(name), p_corrected[block, variant, name])
+                for name, entry in entries.items()
+            }
+            for variant, entries in table.items()
         }
-    return out
+        for block, table in measured.items()
+    }
 
 
 def compare(
@@ -186,8 +229,24 @@ def compare(
     baseline: str,
     margin: float | None = None,
     listed: int = LISTED,
-) -> JsonObject:
-    """Compare one metric of two renderers on their shared cells.
+) -> Difference:
+    """Compare one metric of two renderers on their shared cells, as the only question; the arguments
+    are those of `measure`.
+    """
+    entry = measure(side, base, metric, baseline, margin, listed)
+    return decide(entry, metric, entry.p_value)
+
+
+def measure(
+    side: Side,
+    base: Side,
+    metric: MetricInfo,
+    baseline: str,
+    margin: float | None = None,
+    listed: int = LISTED,
+) -> Difference:
+    """Measure the difference of one metric between two renderers on their shared cells, with its
+    test and its bounds; `decide` gives the verdict.
 
     Args:
         side, base: Their rollouts.
@@ -195,134 +254,162 @@ def compare(
         baseline: What to call ``base``.
         margin: How much worse is accepted, in the metric's unit; None: its own margin.
         listed: How many missing cells to name.
-
-    Returns:
-        ``baseline``; ``diff`` (``side`` minus ``base``: mean over scenes of the scene's mean difference);
-        ``ci95`` ([low, high], scenes as unit) and its ``method``; ``guarded`` (the bounds that a
-        verdict and a difference must hold for as well, or None, with which nothing is decided:
-        `difference_bounds`); ``p_value`` and ``test``; ``margin`` and ``verdict`` (non-inferior,
-        worse, undecided); ``difference`` (better, worse, none shown; independent of the margin);
-        ``more_scenes`` (how many would decide an undecided verdict, else None); ``spread``
-        (standard deviation of the difference between scenes); ``scenes`` (``up``, ``down``,
-        ``same``, and ``p_value`` of their exact sign test); for flags ``cells`` (``only_here``,
-        ``only_baseline``, and the exact McNemar ``p_value``, as if cells were independent);
-        ``n_cells``, ``n_scenes``, ``n_missing`` and ``missing`` (planned cells without a pair:
-        cell, side, why); ``unit``, ``direction``; ``reason`` where numbers are None, ``note`` where
-        they need care.
     """
     margin = metric.accepted if margin is None else margin
     pairs = Pairs(side, base, metric.name)
-    entry: JsonObject = {
-        "baseline": baseline,
-        "diff": None,
-        "ci95": None,
-        "method": None,
-        "guarded": None,
-        "p_value": None,
-        "test": None,
-        "margin": margin,
-        "verdict": "undecided",
-        "difference": "none shown",
-        "more_scenes": None,
-        "n_cells": len(pairs.mine),
-        "n_scenes": n_clusters(pairs.scenes),
-        "n_missing": pairs.n_missing,
-        "missing": pairs.missing(metric.name, listed),
-        "unit": metric.unit,
-        "direction": metric.direction,
-    }
+    entry = Difference(
+        baseline=baseline,
+        unit=metric.unit,
+        direction=metric.direction,
+        margin=margin,
+        n_cells=len(pairs.mine),
+        n_scenes=n_clusters(pairs.scenes),
+        n_missing=pairs.n_missing,
+        missing=tuple(pairs.missing(metric.name, listed)),
+    )
     if not len(pairs.mine):
-        return entry | {"reason": NO_PAIR}
+        return replace(entry, reason=NO_PAIR)
     with np.errstate(over="ignore"):
         delta = pairs.mine - pairs.base
     if not np.isfinite(delta).all():
-        return entry | {"reason": TOO_LARGE}
-    means, _ = cluster_means(delta, pairs.scenes)
-    sizes, _ = cluster_means(np.abs(pairs.mine) + np.abs(pairs.base), pairs.scenes)
-    means[np.abs(means) <= ROUNDING * sizes] = 0.0
-    n = len(means)
-    up = int(np.sum(means > 0))
-    down = int(np.sum(means < 0))
-    entry["scenes"] = {
-        "up": up,
-        "down": down,
-        "same": n - up - down,
-        "p_value": sign_test(up, down),
-    }
-    if metric.is_flag:
-        gained = int(np.sum((pairs.mine > 0) & (pairs.base == 0)))
-        lost = int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
-        entry["cells"] = {
-            "only_here": gained,
-            "only_baseline": lost,
-            "p_value": sign_test(gained, lost),
-        }
-    entry["diff"] = mean_of(means)
-    if n < 2:
-        return entry | {"reason": f"needs at least two scenes, found {n}"}
-    p, test = sign_flip(means)
+        return replace(entry, reason=TOO_LARGE)
+    means = _scene_means(pairs, delta)
+    entry = replace(
+        entry,
+        diff=mean_of(means),
+        scenes=_scene_counts(means),
+        cells=_cell_counts(pairs) if metric.is_flag else None,
+    )
+    if len(means) < 2:
+        return replace(entry, reason=f"needs at least two scenes, found {len(means)}")
+    p_value, test = sign_flip(means)
     small, scale = scaled(means)
-    spread = scale * float(np.std(small, ddof=1))
-    shown = difference(entry["diff"], p, metric.direction)
-    entry |= {"spread": spread, "p_value": p, "test": test, "difference": shown}
     interval, guarded = difference_bounds(delta, means, pairs.scenes, metric, margin)
     bounds = within(interval, *metric.difference_range).bounds
-    entry |= {"ci95": bounds, "method": interval.method or None, "guarded": guarded}
+    entry = replace(
+        entry,
+        p_value=p_value,
+        test=test,
+        spread=scale * float(np.std(small, ddof=1)),
+        ci95=_pair_of(bounds),
+        method=interval.method or None,
+        guarded=_pair_of(guarded),
+        note=interval.note or None,
+    )
     if bounds is None:
-        return entry | {"reason": interval.reason}
-    reach = reach_of(metric, margin)
-    rare = beyond_share(metric, margin)
-    notes = [interval.note] if interval.note else []
-    both = bounds
-    if guarded is not None:
-        both = [min(bounds[0], guarded[0]), max(bounds[1], guarded[1])]
-    if rare:
-        entry["beyond"] = _beyond(pairs, Pairs(side, base, metric.event), metric, reach)
-        entry["beyond"]["margin"] = rare
-    if n < LEAST_SCENES:
-        notes.append(f"{n} scenes: a verdict needs at least {LEAST_SCENES}")
-    elif guarded is None:
-        notes.append(
-            "nothing says how much a scene can differ, so that nothing is decided without a margin"
-        )
-    else:
-        entry["verdict"] = verdict(both, p, margin, metric.direction)
-        seen = verdict(bounds, p, margin, metric.direction)
-        if seen != entry["verdict"]:
-            turned = "worse" if seen == "non-inferior" else "better"
-            by = f"{reach:g} {metric.unit}".rstrip()
-            notes.append(f"{n} scenes cannot exclude that a few others are {turned} by up to {by}")
-        if entry["verdict"] == "non-inferior" and rare and entry["beyond"]["at_most"] >= rare:
-            entry["verdict"] = "undecided"
-            what = f"{entry['beyond']['event']} in more than {100 * rare:.3g} % of others"
-            notes.append(f"{n} scenes cannot exclude {what}")
-    if notes:
-        entry["note"] = "; ".join(notes)
-    if entry["verdict"] == "undecided" and (metric.direction != "none" or margin > 0.0):
-        worse = abs(entry["diff"])
-        if metric.direction != "none":
-            worse, _ = harm([entry["diff"]] * 2, metric.direction)
-        entry["more_scenes"] = more_scenes(worse, spread, n, margin, reach or None, rare)
+        return replace(entry, reason=interval.reason, note=None)
+    if beyond_share(metric, margin):
+        event_pairs = Pairs(side, base, metric.event)
+        return replace(entry, beyond=_beyond(pairs, event_pairs, metric, margin))
     return entry
 
 
-def _beyond(pairs: Pairs, left: Pairs, metric: MetricInfo, reach: float) -> JsonObject:
-    """Return the companion of a distance: how much more often something happens that it does not
-    count, by the metric's event where a preset has it, else by differences beyond ``reach``.
+def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> Difference:
+    """Decide about a difference: what is shown on its scenes, and the verdict about others.
 
-    Returns:
-        ``event`` in words, ``diff`` (share of scenes, positive is worse), ``at_most`` (its upper
-        guarded bound).
+    Args:
+        entry: What `measure` gave.
+        metric: What was compared.
+        p_corrected: Its p-value, corrected for what else is tested; None where there is no test.
     """
-    what, scenes, change = metric.event, left.scenes, left.mine - left.base
+    if entry.diff is None or p_corrected is None:
+        return entry
+    entry = replace(
+        entry,
+        p_corrected=p_corrected,
+        difference=difference(entry.diff, p_corrected, metric.direction),
+    )
+    if entry.ci95 is None:
+        return entry
+    answer, reasons = _verdict_about_others(entry, metric, entry.ci95, p_corrected)
+    notes = [*([entry.note] if entry.note else []), *reasons]
+    entry = replace(entry, verdict=answer, note="; ".join(notes) or None)
+    if answer != "undecided" or (metric.direction == "none" and entry.margin == 0.0):
+        return entry
+    return replace(entry, more_scenes=_more_scenes(entry, metric))
+
+
+def _verdict_about_others(
+    entry: Difference, metric: MetricInfo, bounds: Bounds, p_corrected: float
+) -> tuple[Verdict, list[str]]:
+    """Return the verdict about scenes that were not drawn, and what kept it from being another."""
+    n, margin, guarded = entry.n_scenes, entry.margin, entry.guarded
+    if n < LEAST_SCENES:
+        return "undecided", [f"{n} scenes: a verdict needs at least {LEAST_SCENES}"]
+    if guarded is None:
+        return "undecided", [
+            "nothing says how much a scene can differ, so that nothing is decided without a margin"
+        ]
+    joined = (min(bounds[0], guarded[0]), max(bounds[1], guarded[1]))
+    answer = verdict(joined, p_corrected, margin, metric.direction)
+    unguarded = verdict(bounds, p_corrected, margin, metric.direction)
+    reasons = []
+    if unguarded != answer:
+        turned = "worse" if unguarded == "non-inferior" else "better"
+        by = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
+        reasons.append(f"{n} scenes cannot exclude that a few others are {turned} by up to {by}")
+    beyond = entry.beyond
+    if answer == "non-inferior" and beyond is not None and beyond.at_most >= beyond.margin:
+        answer = "undecided"
+        event = f"{beyond.event} in more than {100 * beyond.margin:.3g} % of others"
+        reasons.append(f"{n} scenes cannot exclude {event}")
+    return answer, reasons
+
+
+def _more_scenes(entry: Difference, metric: MetricInfo) -> int | None:
+    """Return how many more scenes would decide an undecided difference; None where none would."""
+    if entry.diff is None or entry.spread is None:
+        return None
+    worse = abs(entry.diff)
+    if metric.direction != "none":
+        worse, _ = harm((entry.diff, entry.diff), metric.direction)
+    reach = reach_of(metric, entry.margin) or None
+    rare = beyond_share(metric, entry.margin)
+    return more_scenes(worse, entry.spread, entry.n_scenes, entry.margin, reach, rare)
+
+
+def _scene_means(pairs: Pairs, delta: F64) -> F64:
+    """Return the mean difference of each scene ``(G,)`` from those of the cells ``(N,)``; what is
+    only rounding is 0.
+    """
+    means, _ = cluster_means(delta, pairs.scenes)
+    sizes, _ = cluster_means(np.abs(pairs.mine) + np.abs(pairs.base), pairs.scenes)
+    means[np.abs(means) <= ROUNDING * sizes] = 0.0
+    return means
+
+
+def _scene_counts(means: F64) -> SceneCounts:
+    up = int(np.sum(means > 0))
+    down = int(np.sum(means < 0))
+    return SceneCounts(up, down, len(means) - up - down, sign_test(up, down))
+
+
+def _cell_counts(pairs: Pairs) -> CellCounts:
+    gained = int(np.sum((pairs.mine > 0) & (pairs.base == 0)))
+    lost = int(np.sum((pairs.mine == 0) & (pairs.base > 0)))
+    return CellCounts(gained, lost, sign_test(gained, lost))
+
+
+def _pair_of(bounds: Sequence[float] | None) -> Bounds | None:
+    return None if bounds is None else (bounds[0], bounds[1])
+
+
+def _beyond(pairs: Pairs, event_pairs: Pairs, metric: MetricInfo, margin: float) -> Beyond:
+    """Return how much more often something happens that a distance does not count: by the metric's
+    event where a preset has it, else by differences beyond `reach_of`.
+    """
+    reach = reach_of(metric, margin)
+    event = metric.event
+    scenes = event_pairs.scenes
+    change = event_pairs.mine - event_pairs.base
     if not len(change):
-        what = f"more than {reach:g} {metric.unit}".rstrip()
+        event = f"more than {reach:g} {metric.unit}".rstrip()
         scenes = pairs.scenes
         far = pairs.mine - pairs.base
         worse = {"none": np.abs(far), "lower": far, "higher": -far}[metric.direction]
         change = np.where(worse > reach, 1.0, 0.0) - np.where(worse < -reach, 1.0, 0.0)
     means, _ = cluster_means(change, scenes)
-    return {"event": what, "diff": mean_of(means), "at_most": upper_bound(means, 1.0)}
+    return Beyond(event, mean_of(means), upper_bound(means, 1.0), beyond_share(metric, margin))
 
 
 def difference_bounds(
@@ -432,7 +519,7 @@ class Pairs:
         self.only_base = np.flatnonzero(base.place_in(side) < 0)
         self.n_missing = int(np.sum(~self.both)) + len(self.only_base)
 
-    def missing(self, metric: str, listed: int) -> list[JsonObject]:
+    def missing(self, metric: str, listed: int) -> list[MissingPair]:
         """Name the first cells without a pair, with side and cause."""
         (side, _), (base, _) = self._sides.values()
         # Both sides are sorted already.
@@ -440,21 +527,15 @@ class Pairs:
         cells += [base.cells[i] for i in self.only_base[:listed].tolist()]
         return [self.cause(cell, metric) for cell in sorted(cells)[:listed]]
 
-    def cause(self, cell: Cell, metric: str) -> JsonObject:
+    def cause(self, cell: Cell, metric: str) -> MissingPair:
         """Name a cell without a pair, with side and cause."""
         policy, scene, seed = cell
-        causes = {
-            name: side.why_missing(cell, metric, values)
-            for name, (side, values) in self._sides.items()
-        }
-        reasons = {name: text for name, text in causes.items() if text}
-        why = "; ".join(f"{name}: {text}" for name, text in reasons.items())
-        if causes["here"] == causes["baseline"]:
-            why = f"both: {causes['here']}"
-        return {
-            "policy": policy,
-            "scene": scene,
-            "seed": seed,
-            "missing": "both" if len(reasons) == 2 else next(iter(reasons)),
-            "why": why,
-        }
+        (side, values), (base, base_values) = self._sides.values()
+        here = side.why_missing(cell, metric, values)
+        there = base.why_missing(cell, metric, base_values)
+        if not there:
+            return MissingPair(policy, scene, seed, "here", f"here: {here}")
+        if not here:
+            return MissingPair(policy, scene, seed, "baseline", f"baseline: {there}")
+        why = f"both: {here}" if here == there else f"here: {here}; baseline: {there}"
+        return MissingPair(policy, scene, seed, "both", why)

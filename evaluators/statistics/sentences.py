@@ -2,14 +2,11 @@
 report and the terminal.
 """
 
-from typing import Any
-
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
+from evaluators.results import Difference
 from evaluators.statistics.intervals import FEW_SCENES
 from evaluators.statistics.numbers import (
-    finite,
-    interval,
     plural,
     printed,
     scale_and_unit,
@@ -21,37 +18,34 @@ MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 NAMED = 3  # scenes and cells in a sentence
 
 
-def difference_text(entry: JsonView, metric: MetricInfo) -> str:
+def difference_text(entry: Difference, metric: MetricInfo) -> str:
     """Say a paired difference, its interval, and what would decide it.
 
     Args:
-        entry: As `evaluators.statistics.paired.compare` gives it.
+        entry: The difference.
         metric: What was compared.
     """
-    difference = finite(entry.get("diff"))
-    if difference is None:
-        return str(entry.get("reason") or "no difference")
+    if entry.diff is None:
+        return entry.reason or "no difference"
     scale, unit = scale_and_unit(metric, metric.unit)
-    bounds = interval(entry.get("ci95")) or ()
-    numbers = printed(metric, difference, *bounds, sign=True)
+    bounds = entry.ci95 or ()
+    numbers = printed(metric, entry.diff, *bounds, sign=True)
     text = f"{numbers[0]}\u00a0{unit}".strip("\u00a0")
-    n = int(entry.get("n_scenes") or 0)
-    p = finite(entry.get("p_value"))
-    if p is not None and 1 < n < FEW_SCENES:
+    n = entry.n_scenes
+    if entry.p_value is not None and 1 < n < FEW_SCENES:
         can = "" if n >= LEAST_SCENES else f", {plural(n, 'scene')} cannot decide"
-        text = f"exact test p = {short(p)}{can}; {text}"
+        text = f"exact test p = {short(entry.p_value)}{can}; {text}"
     if bounds:
         text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
-    needed = more_scenes_text(entry.get("more_scenes"))
-    margin = finite(entry.get("margin"))
-    if needed and margin is not None:
-        text += f"; {needed} on the margin of {short(margin * scale, unit)}"
+    needed = more_scenes_text(entry.more_scenes)
+    if needed:
+        text += f"; {needed} on the margin of {short(entry.margin * scale, unit)}"
     return text
 
 
-def more_scenes_text(more: Any) -> str:
+def more_scenes_text(more: int | None) -> str:
     """Say how many more scenes an undecided verdict needs; empty where that is unknown."""
-    if not isinstance(more, int) or more <= 0:
+    if more is None:
         return ""
     if more > MANY_SCENES:
         return f"more than {MANY_SCENES} more scenes would decide"

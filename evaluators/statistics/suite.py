@@ -15,9 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
+from evaluators.results import MissingPair, Verdict
 from evaluators.statistics.intervals import TAIL, cluster_means
 from evaluators.statistics.noise import (
     CUT_MARGINS,
@@ -33,7 +34,7 @@ from evaluators.statistics.noise import (
     seeds_for_rate,
 )
 from evaluators.statistics.paired import Pairs
-from evaluators.statistics.verdicts import Verdict, flipped_sums
+from evaluators.statistics.verdicts import flipped_sums
 
 ROUNDING = 1e-9  # a smaller difference, relative, may come from another processor
 LISTED = 50  # cells named of a check; counts are always whole
@@ -67,7 +68,7 @@ class Change:
     is_cut: Bool
     n_neither: int
     n_short: int
-    missing: Sequence[JsonView]
+    missing: Sequence[MissingPair]
 
     @property
     def harms(self) -> list[F64]:

@@ -3,12 +3,13 @@ with the bounds that this allows.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
@@ -21,6 +22,14 @@ from alpasim_plugin.log.run_folder.sides import (
     reason_of,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.results import (
+    Bounds,
+    Censoring,
+    DifferenceTable,
+    InvalidValues,
+    Mean,
+    MeanTable,
+)
 from evaluators.statistics.bounded import mean_interval, rate_interval
 from evaluators.statistics.intervals import (
     cluster_means,
@@ -28,10 +37,10 @@ from evaluators.statistics.intervals import (
     n_clusters,
     normal_half_width,
 )
-from evaluators.statistics.paired import Table, compare_pairs, pairs_within
+from evaluators.statistics.paired import compare_pairs, pairs_within
 
 
-def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
+def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> MeanTable:
     """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 %
     interval.
 
@@ -42,16 +51,14 @@ def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> Table:
         known: What the metrics are.
 
     Returns:
-        RENDERER -> METRIC -> ``mean``, ``ci95`` (half-width 1.96 s / sqrt(N)), ``ci95_clustered``
-        ([low, high], scenes as clusters) and its ``ci95_clustered_method``,
-        ``n_rollouts``, ``n_scenes``, ``n_invalid``, ``unit``, ``direction``; for rates also
-        ``n_events``. What does not exist is None, with ``reason`` (no mean) or ``ci95_reason`` /
-        ``ci95_clustered_reason``; ``note`` qualifies the clustered interval.
+        RENDERER -> METRIC -> mean.
     """
     return aggregate_sides(by_renderer(rows), metric_names(rows), known)
 
 
-def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable) -> Table:
+def aggregate_sides(
+    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable
+) -> MeanTable:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:
@@ -61,72 +68,68 @@ def aggregate_sides(sides: Mapping[str, Side], metrics: Sequence[str], known: Me
     """
     # Metric by metric: renderers share its column and its draws.
     entries = {
-        name: {renderer: _entry(side, known.info(name)) for renderer, side in sides.items()}
+        name: {renderer: _mean(side, known.info(name)) for renderer, side in sides.items()}
         for name in metrics
     }
     return {renderer: {name: entries[name][renderer] for name in metrics} for renderer in sides}
 
 
-def _entry(side: Side, metric: MetricInfo) -> JsonObject:
+def _mean(side: Side, metric: MetricInfo) -> Mean:
     by_cell = side.values(metric.name)
-    known = np.isfinite(by_cell)
-    values = by_cell[known]
-    scenes = side.scene[known]
+    is_known = np.isfinite(by_cell)
+    values = by_cell[is_known]
+    scenes = side.scene[is_known]
     n = len(values)
     n_ran = int(side.ok.sum())
-    entry: JsonObject = {
-        "mean": None,
-        "ci95": None,
-        "ci95_clustered": None,
-        "ci95_clustered_method": None,
-        "n_rollouts": n,
-        "n_scenes": n_clusters(scenes),
-        "n_invalid": max(n_ran - n, 0),
-        "unit": metric.unit,
-        "direction": metric.direction,
-    }
-    if n == 0:
-        return entry | {
-            "reason": "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"
-        }
-    entry["mean"] = mean_of(values)
-    entry["ci95"], why = normal_half_width(values)
-    if why:
-        entry["ci95_reason"] = why
-    interval = mean_interval(cluster_means(values, scenes)[0], metric)
-    entry["ci95_clustered"], entry["ci95_clustered_method"] = (
-        interval.bounds,
-        interval.method or None,
+    entry = Mean(
+        unit=metric.unit,
+        direction=metric.direction,
+        n_rollouts=n,
+        n_scenes=n_clusters(scenes),
+        n_invalid=max(n_ran - n, 0),
     )
-    if interval.reason:
-        entry["ci95_clustered_reason"] = interval.reason
+    if n == 0:
+        reason = "no rollout finished" if n_ran == 0 else f"valid in none of {n_ran} rollouts"
+        return replace(entry, reason=reason)
+    mean = mean_of(values)
+    half_width, no_half_width = normal_half_width(values)
+    interval = mean_interval(cluster_means(values, scenes)[0], metric)
+    bounds = interval.bounds
     notes = [interval.note] if interval.note else []
-    if abs(interval.centre - entry["mean"]) > 1e-9 * max(1.0, abs(entry["mean"])):
+    if abs(interval.centre - mean) > 1e-9 * max(1.0, abs(mean)):
         notes.append(
-            f"scenes have different numbers of values: the interval is about the mean over scenes, {interval.centre:.4g}"
+            "scenes have different numbers of values: "
+            f"the interval is about the mean over scenes, {interval.centre:.4g}"
         )
-    if notes:
-        entry["note"] = "; ".join(notes)
-    if metric.is_flag:
-        entry["n_events"] = int(np.sum(values > 0))
-    return entry
+    return replace(
+        entry,
+        mean=mean,
+        ci95=half_width,
+        ci95_reason=no_half_width or None,
+        ci95_clustered=None if bounds is None else (bounds[0], bounds[1]),
+        ci95_clustered_method=interval.method or None,
+        ci95_clustered_reason=interval.reason or None,
+        note="; ".join(notes) or None,
+        n_events=int(np.sum(values > 0)) if metric.is_flag else None,
+    )
 
 
-STEP_RULES = (
+# The policy drove there, but what happened does not count.
+CUT_RULES = ("steps_after_event", "steps_after_drift")
+COUNTS = (  # of `Censoring`, which add up over runs
+    "rollouts",
     "steps_total",
     "steps_warmup",
     "steps_after_event",
     "steps_after_drift",
     "steps_scored",
+    "frames",
+    "frames_passed_raw",
 )
-CUT_RULES = (
-    "steps_after_event",
-    "steps_after_drift",
-)  # the policy drove there, but what happened does not count
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
-def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, JsonObject]:
+def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, Censoring]:
     """Count what did not enter the table, per renderer and cause.
 
     Args:
@@ -136,73 +139,84 @@ def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, Js
         known: What the metrics are.
 
     Returns:
-        RENDERER -> ``rollouts`` (planned), ``failed`` (by failure class), ``dropped`` (by reason),
-        the step counts of the ledger summed over rollouts, ``frames`` (rendered in rollouts that
-        ran to their end), ``frame_events`` (by kind: ``black``, ``fixer-nan``, ...),
-        ``frames_passed_raw`` (the fixer's guard took the raw frame), ``invalid`` (METRIC -> number
-        of rollouts and their reasons), and for every rate METRIC -> [least, greatest]:
-        ``bounds_rollouts`` (every missing rollout without, and with, the event),
-        ``bounds_rollouts_ci95`` (the same with sampling error: the low end of the 95 % interval
-        over scenes of the one, the high end of the other; None with one scene) and ``bounds`` (also
-        every step that was cut from a scored rollout without, and with, the event), with ``cut``
-        (METRIC -> rollouts that were cut before the event was seen).
+        RENDERER -> what was removed, and the bounds of rates that this allows.
     """
     names = metric_names(rows)
     return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
 
 
-def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> JsonObject:
+def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> Censoring:
     done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
+    lost = [row for row, ok in zip(side.rows, side.ok, strict=True) if not ok]
     ledgers = [row["censored"] for row in done if row.get("censored")]
     events: Counter[str] = Counter()
     for row in done:
         events.update(row.get("frame_events") or {})
-    out: JsonObject = {
-        "rollouts": len(side.rows),
-        "failed": dict(
-            Counter(failure_of(row) for row, ok in zip(side.rows, side.ok, strict=True) if not ok)
-        ),
-        "dropped": dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
-        **{rule: sum(int(ledger[rule]) for ledger in ledgers) for rule in STEP_RULES},
-        "frames": sum(int(row.get("frames") or 0) for row in done),
-        "frame_events": dict(events),
-        "frames_passed_raw": sum(n for event, n in events.items() if event.startswith(FIXER_GUARD)),
-        "invalid": {},
-        "bounds": {},
-        "bounds_rollouts": {},
-        "bounds_rollouts_ci95": {},
-        "cut": {},
-    }
-    steps = [row.get("censored") or {} for row in side.rows]
-    cut = np.array(
-        [sum(int(ledger.get(rule) or 0) for rule in CUT_RULES) for ledger in steps],
-        np.float64,
-    )
-    scored = np.array([int(ledger.get("steps_scored") or 0) for ledger in steps], np.float64)
+
+    def steps(rule: str) -> int:
+        return sum(int(ledger[rule]) for ledger in ledgers)
+
+    invalid: dict[str, InvalidValues] = {}
     for name in names:
-        values = side.raw(name)
-        absent = np.flatnonzero(side.ok & ~np.isfinite(values))
+        absent = np.flatnonzero(side.ok & ~np.isfinite(side.raw(name)))
         if len(absent):
             reasons = Counter(reason_of(side.rows[i], name) for i in absent)
-            out["invalid"][name] = {"rollouts": len(absent), "reasons": dict(reasons)}
-        metric = known.info(name)
-        if metric.is_flag:
-            is_share = metric.aggregation == "mean"
-            out["bounds_rollouts"][name], out["bounds"][name], out["cut"][name] = rate_bounds(
-                values, cut, scored, is_share
-            )
-            scenes = side.scene[side.cell]
-            ends = [
-                rate_interval(cluster_means(np.nan_to_num(values, nan=fill), scenes)[0])
-                for fill in (0.0, 1.0)
-            ]
-            out["bounds_rollouts_ci95"][name] = [ends[0].low, ends[1].high]
-    return out
+            invalid[name] = InvalidValues(len(absent), dict(reasons))
+    rates = {
+        name: _rate_limits(side, known.info(name)) for name in names if known.info(name).is_flag
+    }
+    return Censoring(
+        rollouts=len(side.rows),
+        failed=dict(Counter(map(failure_of, lost))),
+        dropped=dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
+        steps_total=steps("steps_total"),
+        steps_warmup=steps("steps_warmup"),
+        steps_after_event=steps("steps_after_event"),
+        steps_after_drift=steps("steps_after_drift"),
+        steps_scored=steps("steps_scored"),
+        frames=sum(int(row.get("frames") or 0) for row in done),
+        frame_events=dict(events),
+        frames_passed_raw=sum(n for event, n in events.items() if event.startswith(FIXER_GUARD)),
+        invalid=invalid,
+        bounds={name: limits.bounds for name, limits in rates.items()},
+        bounds_rollouts={name: limits.bounds_rollouts for name, limits in rates.items()},
+        bounds_rollouts_ci95={name: limits.bounds_rollouts_ci95 for name, limits in rates.items()},
+        cut={name: limits.n_cut for name, limits in rates.items()},
+    )
 
 
-def rate_bounds(
-    values: F64, cut: F64, scored: F64, is_share: bool
-) -> tuple[list[float], list[float], int]:
+class RateLimits(NamedTuple):
+    """What a rate could be, given what is missing; the members are those of `Censoring`."""
+
+    bounds: Bounds
+    bounds_rollouts: Bounds
+    bounds_rollouts_ci95: tuple[float | None, float | None]
+    n_cut: int
+
+
+def _rate_limits(side: Side, metric: MetricInfo) -> RateLimits:
+    values = side.raw(metric.name)
+    ledgers = [row.get("censored") for row in side.rows]
+    cut = np.array([_steps_cut(ledger) for ledger in ledgers], np.float64)
+    scored = np.array(
+        [int(ledger["steps_scored"]) if ledger else 0 for ledger in ledgers], np.float64
+    )
+    over_rollouts, over_steps, n_cut = rate_bounds(
+        values, cut, scored, is_share=metric.aggregation == "mean"
+    )
+    scenes = side.scene[side.cell]
+    none, every = (
+        rate_interval(cluster_means(np.nan_to_num(values, nan=fill), scenes)[0])
+        for fill in (0.0, 1.0)
+    )
+    return RateLimits(over_steps, over_rollouts, (none.low, every.high), n_cut)
+
+
+def _steps_cut(ledger: JsonView | None) -> int:
+    return sum(int(ledger[rule]) for rule in CUT_RULES) if ledger else 0
+
+
+def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[Bounds, Bounds, int]:
     """Return the least and greatest that a rate could be, given what is missing.
 
     Args:
@@ -227,15 +241,24 @@ def rate_bounds(
         steps = np.maximum(scored + cut, 1.0)
         least = np.where(cut > 0, seen * scored / steps, seen)
         greatest = np.where(cut > 0, (seen * scored + cut) / steps, seen)
-    over_rollouts = [float(seen.sum()) / n, (float(seen.sum()) + missing) / n]
-    return (
-        over_rollouts,
-        [float(least.sum()) / n, (float(greatest.sum()) + missing) / n],
-        int(np.sum(greatest > seen)),
-    )
+    over_rollouts = (float(seen.sum()) / n, (float(seen.sum()) + missing) / n)
+    over_steps = (float(least.sum()) / n, (float(greatest.sum()) + missing) / n)
+    return over_rollouts, over_steps, int(np.sum(greatest > seen))
 
 
 NO_BASES: Mapping[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The tables of means and differences of a summary; the members are those of
+    `evaluators.results.Summary`.
+    """
+
+    metrics: MeanTable
+    paired: DifferenceTable
+    paired_with_base: DifferenceTable
+    paired_policies: DifferenceTable
 
 
 def numbers(
@@ -243,9 +266,8 @@ def numbers(
     baseline: str | None = None,
     bases: Mapping[str, str] = NO_BASES,
     known: MetricTable = METRICS,
-) -> JsonObject:
-    """Return the blocks ``metrics``, ``paired``, ``paired_with_base`` and ``paired_policies`` of
-    ``summary.json`` (docs/statistics.md).
+) -> Numbers:
+    """Return the means and the paired differences of a run (docs/statistics.md).
 
     Args:
         table: The rollouts.
@@ -259,31 +281,58 @@ def numbers(
         policy: aggregate_sides(table.sides(policy), table.metrics, known)
         for policy in table.policies
     }
-    paired, with_base, policies = (
-        compare_pairs(table, pairs, known) for pairs in pairs_within(table, baseline, bases)
-    )
+    blocks = compare_pairs(table, pairs_within(table, baseline, bases), known)
+    return Numbers(metrics=by_policy(metrics), **blocks)
+
+
+T = TypeVar("T")
+
+
+def by_policy(tables: Mapping[str, Mapping[str, T]]) -> dict[str, T]:
+    """Join tables of policies into one. With one policy its keys are RENDERER, with several
+    RENDERER/POLICY: policies are never averaged.
+
+    Args:
+        tables: POLICY -> RENDERER -> entry.
+    """
+    if len(tables) == 1:
+        return dict(*tables.values())
     return {
-        "metrics": by_policy(metrics, dict),
-        "paired": paired,
-        "paired_with_base": with_base,
-        "paired_policies": policies,
+        cell_name(renderer, policy): entry
+        for policy, table in tables.items()
+        for renderer, entry in table.items()
     }
 
 
-def by_policy(parts: JsonView, table: Callable[[Any], JsonView]) -> JsonObject:
-    """Make a table per policy. With one policy its keys are RENDERER, with several RENDERER/POLICY:
-    policies are never averaged.
-
-    Args:
-        parts: POLICY -> what the table is made of.
-        table: Gives RENDERER -> entry.
+def joined_censoring(parts: Sequence[Censoring]) -> Censoring:
+    """Return what was removed from the rollouts of several runs together, such as the shards of
+    one; bounds of rates are those of no single run and are left out.
     """
-    out: JsonObject = {}
-    for policy, some in parts.items():
-        part = table(some)
-        out |= (
-            part
-            if len(parts) == 1
-            else {cell_name(renderer, policy): entry for renderer, entry in part.items()}
-        )
-    return out
+
+    def total(name: str) -> int:
+        return sum(getattr(part, name) for part in parts)
+
+    def counted(name: str) -> dict[str, int]:
+        counts: Counter[str] = Counter()
+        for part in parts:
+            counts.update(getattr(part, name))
+        return dict(counts)
+
+    invalid: dict[str, InvalidValues] = {}
+    for part in parts:
+        for metric, values in part.invalid.items():
+            before = invalid.get(metric, InvalidValues(0, {}))
+            reasons = Counter(before.reasons) + Counter(values.reasons)
+            invalid[metric] = InvalidValues(before.rollouts + values.rollouts, dict(reasons))
+    numbers_of = {name: total(name) for name in COUNTS}
+    return Censoring(
+        **numbers_of,
+        failed=counted("failed"),
+        dropped=counted("dropped"),
+        frame_events=counted("frame_events"),
+        invalid=invalid,
+        bounds={},
+        bounds_rollouts={},
+        bounds_rollouts_ci95={},
+        cut=counted("cut"),
+    )

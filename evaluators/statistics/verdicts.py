@@ -4,9 +4,7 @@ of a run with its exit code.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,42 +12,9 @@ import scipy  # its submodules load on first use; scipy.stats would take a secon
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Direction
+from evaluators.results import Bounds, Cause, Contrast, Failures, Outcome, Verdict
 from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
 
-Cause = Literal[
-    "pass",
-    "regression",
-    "incomplete",
-    "policy",
-    "renderer",
-    "fixer",
-    "undecided",
-    "infrastructure",
-    "evaluator",
-]
-
-EXIT_CODES: dict[Cause, int] = {
-    "pass": 0,
-    "regression": 1,
-    "incomplete": 2,
-    "policy": 2,
-    "renderer": 2,
-    "fixer": 2,
-    "undecided": 3,
-    "infrastructure": 4,
-    "evaluator": 5,
-}
-WORDS: dict[Cause, str] = {
-    "pass": "PASS",
-    "regression": "FAIL",
-    "incomplete": "INCOMPLETE",
-    "policy": "POLICY FAILURE",
-    "renderer": "RENDERER FAILURE",
-    "fixer": "FIXER FAILURE",
-    "undecided": "UNDECIDED",
-    "infrastructure": "INFRASTRUCTURE FAILURE",
-    "evaluator": "EVALUATOR FAILURE",
-}
 # Where causes meet, the first one found here decides: numbers from an incomplete run may mislead
 # either way.
 SEVERITY: tuple[Cause, ...] = (
@@ -63,28 +28,6 @@ SEVERITY: tuple[Cause, ...] = (
     "undecided",
     "pass",
 )
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A cause with one sentence for each thing that led to it."""
-
-    cause: Cause
-    reasons: tuple[str, ...] = ()
-
-    @property
-    def exit_code(self) -> int:
-        """Give the process exit code (docs/cli.md)."""
-        return EXIT_CODES[self.cause]
-
-    @property
-    def title(self) -> str:
-        """Give the verdict as a heading."""
-        return WORDS[self.cause]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the outcome for JSON."""
-        return {"cause": self.cause, "exit_code": self.exit_code, "reasons": list(self.reasons)}
 
 
 def worst(outcomes: list[Outcome]) -> Outcome:
@@ -124,27 +67,21 @@ CAUSES: dict[str, Cause] = {
 }
 
 
-def outcome_of_failures(failures: Mapping[str, Any], max_share: float = 0.0) -> Outcome:
+def outcome_of_failures(failures: Failures, max_share: float = 0.0) -> Outcome:
     """Decide about rollouts that could not be run or scored.
 
     Args:
-        failures: The ``failures`` block of summary.json: ``n_failed``, ``n_rollouts``,
-            ``by_class``.
+        failures: How many there are.
         max_share: Share of the planned rollouts that may fail.
     """
-    n = int(failures["n_rollouts"])
-    n_failed = int(failures["n_failed"])
-    by_class = failures["by_class"]
-    if n_failed <= max_share * n:
+    if failures.n_failed <= max_share * failures.n_rollouts:
         return Outcome("pass")
-    counts = ", ".join(f"{name} {count}" for name, count in by_class.items())
-    text = f"{n_failed} of {n} rollouts could not be run or scored ({counts})"
-    causes = {CAUSES.get(name, "infrastructure") for name in by_class}
+    counts = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())
+    share = f"{failures.n_failed} of {failures.n_rollouts}"
+    text = f"{share} rollouts could not be run or scored ({counts})"
+    causes = {CAUSES.get(name, "infrastructure") for name in failures.by_class}
     return Outcome(min(causes, key=SEVERITY.index), (text,))
 
-
-Verdict = Literal["non-inferior", "worse", "undecided"]
-Difference = Literal["better", "worse", "none shown"]
 
 ALPHA = 0.05
 LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
@@ -155,14 +92,12 @@ FLIPS = 9_999  # drawn where not all of them are counted
 FLIPPED = 10_000_000  # signs that are drawn at most
 
 
-def harm(bounds: list[float], direction: Direction) -> tuple[float, float]:
+def harm(bounds: Bounds, direction: Direction) -> tuple[float, float]:
     """Turn the bounds of a difference so that positive means worse."""
     return (bounds[0], bounds[1]) if direction == "lower" else (-bounds[1], -bounds[0])
 
 
-def verdict(
-    bounds: list[float] | None, p: float | None, margin: float, direction: Direction
-) -> Verdict:
+def verdict(bounds: Bounds | None, p: float | None, margin: float, direction: Direction) -> Verdict:
     """Decide about a difference by its 95 % interval.
 
     Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is
@@ -191,12 +126,17 @@ def verdict(
     return "worse" if low > margin and p is not None and p < ALPHA else "undecided"
 
 
-def difference(diff: float, p: float, direction: Direction) -> Difference:
-    """Return whether a difference is shown on the scenes driven: the test rejects, whatever the
-    margin and whatever other scenes may do.
+def difference(diff: float, p: float, direction: Direction) -> Contrast | None:
+    """Return whether a difference is shown on the scenes driven, whatever the margin and whatever
+    other scenes may do: the test rejects. None where it does not.
+
+    Args:
+        diff: Variant minus baseline.
+        p: Of the test of no difference, corrected where several differences are tested.
+        direction: The better side of the metric.
     """
     if direction == "none" or p >= ALPHA:
-        return "none shown"
+        return None
     return "worse" if (diff > 0.0) == (direction == "lower") else "better"
 
 
@@ -277,31 +217,29 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return out
 
 
-Question = tuple[int, str]  # number of a comparison, metric
+Question = tuple[str, str, str]  # block of comparisons, variant, metric
 
 
-def shown_questions(p_values: Mapping[Question, float | None], primary: str) -> set[Question]:
-    """Return the questions whose difference holds among so many: the primary metric of all
-    comparisons shares one level, all other metrics share another (Holm's method).
+def corrected(
+    p_values: Mapping[Question, float | None], primary: str
+) -> dict[Question, float | None]:
+    """Return the p-values of everything that is tested together, corrected by Holm's method: the
+    primary metric of all comparisons is one family, all other metrics are another.
 
     Args:
-        p_values: Of every question; one without a test holds.
-        primary: The metric that the run declared; empty where all share one level.
+        p_values: Of every question; None where there is no test.
+        primary: The metric that was declared before driving.
 
     Example:
-        >>> sorted(shown_questions({(0, "a"): 0.04, (0, "b"): 0.04, (0, "c"): 0.03}, "a"))
-        [(0, 'a')]
+        >>> corrected({("paired", "b", "a"): 0.03, ("paired", "c", "a"): 0.04}, "a")
+        {('paired', 'b', 'a'): 0.06, ('paired', 'c', 'a'): 0.06}
     """
-    shown: set[Question] = set()
+    out: dict[Question, float | None] = {}
     for is_primary in (True, False):
-        family = [question for question in p_values if (question[1] == primary) == is_primary]
-        corrected = holm([p_values[question] for question in family])
-        shown |= {
-            question
-            for question, p in zip(family, corrected, strict=True)
-            if p is None or p <= ALPHA
-        }
-    return shown
+        family = [question for question in p_values if (question[2] == primary) == is_primary]
+        values = holm([p_values[question] for question in family])
+        out |= dict(zip(family, values, strict=True))
+    return out
 
 
 POWER = 0.8

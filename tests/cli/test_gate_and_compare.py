@@ -258,7 +258,7 @@ def test_compare_of_two_runs_pairs_the_same_renderer_on_shared_cells_and_lists_t
     assert {cell["why"] for cell in entry["missing"]} == {"here: not planned"}
     assert entry["baseline"] == f"{runs['good']}: onefixer"
     with_one = _compare(capsys, str(runs["good"]), str(runs["bad"]), "--baseline", "clean")
-    assert with_one["onefixer"]["offroad"]["verdict"] == "worse"
+    assert with_one["onefixer"]["offroad_or_collision_at_fault"]["verdict"] == "worse"
 
 
 def test_joined_shards_print_the_one_table(tmp_path, capsys):

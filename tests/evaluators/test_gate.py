@@ -1,12 +1,14 @@
 """Gates: what they ask for, against what, and the one outcome that follows."""
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from evaluators.results import EXIT_CODES, Failures, Outcome
 from evaluators.statistics.gate import (
     GateSpec,
     MetricRule,
@@ -14,14 +16,7 @@ from evaluators.statistics.gate import (
     load_gate,
     shipped_gates,
 )
-from evaluators.statistics.verdicts import (
-    EXIT_CODES,
-    SEVERITY,
-    Outcome,
-    outcome_of_failures,
-    worst,
-    worst_code,
-)
+from evaluators.statistics.verdicts import SEVERITY, outcome_of_failures, worst, worst_code
 from tests.evaluators.gate_tables import SCENES, add, rows, table_of
 
 RULES = {
@@ -395,13 +390,13 @@ def test_text_and_exit_code_come_from_one_object_and_the_worst_cause_decides():
     }
     for one, other in itertools.product(SEVERITY, SEVERITY):
         assert worst([Outcome(one), Outcome(other)]).cause == min(one, other, key=SEVERITY.index)
-    failures = {"n_failed": 2, "n_rollouts": 9, "by_class": {"evaluator": 1, "policy": 1}}
-    assert outcome_of_failures(failures).exit_code == 5
+    mixed = Failures(n_failed=2, n_rollouts=9, by_class={"evaluator": 1, "policy": 1})
+    assert outcome_of_failures(mixed).exit_code == 5
     for by_class, wanted in (({"input": 2}, 2), ({"renderer": 1, "evaluator": 1}, 5)):
-        assert outcome_of_failures(failures | {"by_class": by_class}).exit_code == wanted
+        assert outcome_of_failures(replace(mixed, by_class=by_class)).exit_code == wanted
     assert worst_code([1, 3, 2, 0]) == 2
-    assert outcome_of_failures(failures | {"by_class": {"policy": 2}}).exit_code == 2
-    assert outcome_of_failures(failures | {"n_failed": 0, "by_class": {}}).exit_code == 0
+    assert outcome_of_failures(replace(mixed, by_class={"policy": 2})).exit_code == 2
+    assert outcome_of_failures(replace(mixed, n_failed=0, by_class={})).exit_code == 0
 
 
 # --- files

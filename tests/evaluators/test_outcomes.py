@@ -198,14 +198,14 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
     }
     manifests = [manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost]
     table = outcome_table(rollouts_of_table(rollout_table(manifests)), times_of(manifests))
-    assert table["clean/a"]["endings"] == {"reached the end": 1}
-    assert table["clean/b"]["endings"] == {"off-road": 1, "policy fault": 1, "not run": 1}
-    (cell,) = table["clean/b"]["outcomes"]["offroad"]["cells"]
-    assert (cell["scene"], cell["t_s"]) == ("one", 3.1)
+    assert table["clean/a"].endings == {"reached the end": 1}
+    assert table["clean/b"].endings == {"off-road": 1, "policy fault": 1, "not run": 1}
+    (cell,) = table["clean/b"].outcomes["offroad"].cells
+    assert (cell.scene, cell.t_s) == ("one", 3.1)
     assert (
-        table["clean/b"]["n_rollouts"],
-        table["clean/b"]["n_ended"],
-        table["clean/b"]["n_failed"],
+        table["clean/b"].n_rollouts,
+        table["clean/b"].n_ended,
+        table["clean/b"].n_failed,
     ) == (3, 2, 2)
 
 

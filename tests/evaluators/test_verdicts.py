@@ -6,6 +6,7 @@ from scipy import stats
 
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators import METRICS, paired
+from evaluators.results import CellCounts, SceneCounts
 from evaluators.statistics.paired import compare
 from evaluators.statistics.verdicts import holm, sign_flip, verdict
 from tests.evaluators.rollout_rows import rows_of
@@ -52,16 +53,16 @@ def test_a_metric_without_a_better_side_is_worse_on_either_side_of_its_margin():
 def test_margins_are_given_or_the_documented_defaults():
     base = [[float(i)] for i in range(8)]
     other = [[i + 0.3 + 0.01 * (i % 3)] for i in range(8)]
-    assert pair(base, other)["margin"] == 0.1
-    assert pair(base, other, margin=0.2)["margin"] == 0.2
-    assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad")["margin"] == 0.02
+    assert pair(base, other).margin == 0.1
+    assert pair(base, other, margin=0.2).margin == 0.2
+    assert pair([[0.0]] * 3, [[0.0]] * 3, "offroad").margin == 0.02
     many = [[float(i)] for i in range(400)]
     assert (
         pair(
             many,
             [[v[0] + 0.3 + 0.01 * (v[0] % 3)] for v in many],
             margin=0.5,
-        )["verdict"]
+        ).verdict
         == "non-inferior"
     )
 
@@ -70,20 +71,20 @@ def test_an_undecided_difference_says_how_many_more_scenes_would_decide_it():
     rng = np.random.Generator(np.random.Philox(2))
     base = rng.normal(1.0, 0.5, (8, 1))
     found = pair(base.tolist(), (base + rng.normal(0.3, 0.5, (8, 1))).tolist())
-    assert found["verdict"] == "undecided"
-    assert found["spread"] == pytest.approx(0.5, rel=0.6)
-    assert 5 < found["more_scenes"] < 2000
+    assert found.verdict == "undecided"
+    assert found.spread == pytest.approx(0.5, rel=0.6)
+    assert 5 < found.more_scenes < 2000
     assert (
-        pair([[1.0], [2.0]], [[1.0], [2.0]])["more_scenes"] == 368 - 2
+        pair([[1.0], [2.0]], [[1.0], [2.0]]).more_scenes == 368 - 2
     )  # as many as show that nothing was missed
 
 
 def test_rare_events_alone_never_decide_on_few_scenes():
     found = pair([[0.0, 0.0]] * 20, [[0.0, 0.0]] * 20, "offroad")
     bound = 1 - 0.025 ** (1 / 20)
-    assert found["ci95"] == pytest.approx([-bound, bound])
-    assert (found["verdict"], found["more_scenes"]) == ("undecided", 183 - 20)  # margin of 2 points
-    assert pair([[0.0]] * 200, [[0.0]] * 200, "offroad")["verdict"] == "non-inferior"
+    assert found.ci95 == pytest.approx([-bound, bound])
+    assert (found.verdict, found.more_scenes) == ("undecided", 183 - 20)  # margin of 2 points
+    assert pair([[0.0]] * 200, [[0.0]] * 200, "offroad").verdict == "non-inferior"
 
 
 def test_scenes_that_cannot_have_shown_a_rare_harm_decide_nothing_however_alike_they_are():
@@ -91,48 +92,44 @@ def test_scenes_that_cannot_have_shown_a_rare_harm_decide_nothing_however_alike_
     for n, wanted in ((20, "undecided"), (140, "undecided"), (400, "non-inferior")):
         base = rng.normal(1.0, 0.5, (n, 1))
         found = pair(base.tolist(), (base + rng.normal(0.0, 0.02, (n, 1))).tolist())
-        assert found["verdict"] == wanted, n
-        low, high = found["ci95"]
+        assert found.verdict == wanted, n
+        low, high = found.ci95
         assert -0.05 < low < high < 0.05, "the interval of what was seen stays narrow"
-        assert found["guarded"][1] == pytest.approx(4.0 * (1 - 0.025 ** (1 / n)), abs=0.03)
+        assert found.guarded[1] == pytest.approx(4.0 * (1 - 0.025 ** (1 / n)), abs=0.03)
     few = pair([[1.0]] * 20, [[1.001], [0.999]] * 10)
-    assert few["note"] == "20 scenes cannot exclude that a few others are worse by up to 4 m"
-    assert few["more_scenes"] == 368 - 20
+    assert few.note == "20 scenes cannot exclude that a few others are worse by up to 4 m"
+    assert few.more_scenes == 368 - 20
 
 
 def test_equal_scenes_have_no_spread_to_go_by():
     for equal in (0.0, 0.1 + 0.2, 1e-9):
         found = pair([[1.0 + i] for i in range(8)], [[1.0 + i + equal] for i in range(8)])
-        assert found["verdict"] == "undecided"
-        assert found["difference"] == ("worse" if equal else "none shown")
-        assert found["ci95"] == found["guarded"]
-        assert found["ci95"][1] > 1.0
-        assert "8 scenes are equal" in found["note"]
+        assert found.verdict == "undecided"
+        assert found.difference == ("worse" if equal else None)
+        assert found.ci95 == found.guarded
+        assert found.ci95[1] > 1.0
+        assert "8 scenes are equal" in found.note
     two = pair([[1.0], [1.0]], [[1.0], [1.0]])
-    assert (two["verdict"], two["difference"]) == ("undecided", "none shown")
-    assert two["note"].endswith("2 scenes: a verdict needs at least 6")
+    assert (two.verdict, two.difference) == ("undecided", None)
+    assert two.note.endswith("2 scenes: a verdict needs at least 6")
 
 
 def test_values_at_the_end_of_the_numbers_decide_nothing():
     huge = pair([[0.0]] * 8, [[0.5e308 * (i % 4)] for i in range(8)])
-    assert huge["diff"] == pytest.approx(0.75e308)
-    assert np.isfinite([*huge["ci95"], *huge["guarded"], huge["p_value"]]).all()
+    assert huge.diff == pytest.approx(0.75e308)
+    assert np.isfinite([*huge.ci95, *huge.guarded, huge.p_value]).all()
     beyond = pair([[-1e308]] * 8, [[1e308]] * 8)
-    assert (beyond["verdict"], beyond["ci95"]) == ("undecided", None)
-    assert "too large" in beyond["reason"]
+    assert (beyond.verdict, beyond.ci95) == ("undecided", None)
+    assert "too large" in beyond.reason
 
 
 def test_mcnemar_counts_cells_and_the_sign_test_scenes():
     base = [[0.0, 0.0, 1.0]] * 4 + [[0.0, 0.0, 0.0]] * 4
     other = [[1.0, 1.0, 0.0]] * 4 + [[0.0, 0.0, 0.0]] * 4
     found = pair(base, other, "collision_any")
-    assert found["cells"] == {
-        "only_here": 8,
-        "only_baseline": 4,
-        "p_value": pytest.approx(stats.binomtest(8, 12).pvalue),
-    }
-    assert found["scenes"] == {"up": 4, "down": 0, "same": 4, "p_value": pytest.approx(2 * 0.5**4)}
-    assert found["p_value"] == found["scenes"]["p_value"]
+    assert found.cells == CellCounts(8, 4, pytest.approx(stats.binomtest(8, 12).pvalue))
+    assert found.scenes == SceneCounts(4, 0, 4, pytest.approx(2 * 0.5**4))
+    assert found.p_value == found.scenes.p_value
 
 
 def test_every_cell_without_a_pair_is_named_with_its_side_and_cause():
@@ -140,25 +137,25 @@ def test_every_cell_without_a_pair_is_named_with_its_side_and_cause():
     other = rows_of([[1.5, 1.5], [2.5, None]])[:3] + rows_of([[0.0]])[:0]
     other[1] |= {"status": "failed", "failure_class": "renderer"}
     found = paired(base + other, "clean")["3dgs"]["route_distance_m"]
-    assert (found["n_cells"], found["n_missing"]) == (2, 2)
-    first, second = found["missing"]
-    assert (first["scene"], first["seed"], first["missing"], first["why"]) == (
+    assert (found.n_cells, found.n_missing) == (2, 2)
+    first, second = found.missing
+    assert (first.scene, first.seed, first.missing, first.why) == (
         "scene-0",
         1,
         "here",
         "here: failed (renderer)",
     )
-    assert (second["scene"], second["seed"], second["missing"]) == ("scene-1", 1, "both")
-    assert second["why"] == "here: not planned; baseline: not valid (not given)"
-    assert paired(base + other, "clean", listed=1)["3dgs"]["route_distance_m"]["n_missing"] == 2
+    assert (second.scene, second.seed, second.missing) == ("scene-1", 1, "both")
+    assert second.why == "here: not planned; baseline: not valid (not given)"
+    assert paired(base + other, "clean", listed=1)["3dgs"]["route_distance_m"].n_missing == 2
 
 
 def test_a_rate_is_worse_only_by_what_also_holds_for_scenes_that_were_not_drawn():
     def gained(k):
         return pair([[0.0]] * 20, [[1.0]] * k + [[0.0]] * (20 - k), "offroad", margin=0.05)
 
-    assert [gained(k)["verdict"] for k in (6, 7)] == ["undecided", "worse"]
-    assert gained(6)["ci95"][0] > 0.05 > gained(6)["guarded"][0]
+    assert [gained(k).verdict for k in (6, 7)] == ["undecided", "worse"]
+    assert gained(6).ci95[0] > 0.05 > gained(6).guarded[0]
 
 
 def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_it():
@@ -166,7 +163,7 @@ def test_metres_are_worse_or_better_only_where_few_other_scenes_could_not_undo_i
         base = [[50.0 + i] for i in range(n)]
         other = [[50.0 + i + by + 0.01 * (i % 3)] for i in range(n)]
         found = pair(base, other, "lateral_distance_m", **options)
-        return found["verdict"], found["difference"], found.get("note", "")
+        return found.verdict, found.difference, found.note or ""
 
     few = "20 scenes cannot exclude that a few others are {} by up to 4 m"
     assert moved(0.3) == ("undecided", "worse", few.format("better"))
@@ -181,8 +178,8 @@ def test_a_metric_of_which_nothing_says_how_much_a_scene_can_differ_decides_noth
     base = [[float(i)] for i in range(20)]
     other = [[i + 5.0 + 0.01 * (i % 3)] for i in range(20)]
     found = pair(base, other, "contact_x_m")
-    assert (found["verdict"], found["guarded"]) == ("undecided", None)
-    assert "nothing says how much a scene can differ" in found["note"]
+    assert (found.verdict, found.guarded) == ("undecided", None)
+    assert "nothing says how much a scene can differ" in found.note
 
 
 def test_the_correction_is_holms():
@@ -195,11 +192,11 @@ def test_what_differs_on_these_scenes_is_shown_by_their_signs_whatever_others_ma
     rng = np.random.Generator(np.random.Philox(5))
     base = rng.uniform(1.0, 3.0, (60, 1))
     found = pair(base.tolist(), (base + 0.2 + rng.normal(0, 0.05, (60, 1))).tolist())
-    assert (found["difference"], found["verdict"]) == ("worse", "undecided")
-    assert found["p_value"] == 1e-4  # one of 9,999 draws and the one seen
+    assert (found.difference, found.verdict) == ("worse", "undecided")
+    assert found.p_value == 1e-4  # one of 9,999 draws and the one seen
     rounded = pair([[0.3, 0.1]] * 60, [[0.1 + 0.2, 0.1]] * 60)
-    assert rounded["scenes"] == {"up": 0, "down": 0, "same": 60, "p_value": 1.0}
-    assert rounded["p_value"] == 1.0
+    assert rounded.scenes == SceneCounts(up=0, down=0, same=60, p_value=1.0)
+    assert rounded.p_value == 1.0
 
 
 @pytest.mark.parametrize("scenes", [7, 60])
@@ -237,7 +234,7 @@ def test_a_distance_is_no_worse_only_together_with_what_lies_beyond_its_cap(has_
                     left = {"left_route": float(is_far and moved > 0)} if has_event else {}
                     rows.append(row | left)
             found = paired(rows, "clean")["3dgs"]["lateral_distance_m"]
-            passed += found["verdict"] == "non-inferior"
-            assert found["beyond"]["diff"] == pytest.approx(np.mean(far))
-            assert found["beyond"]["event"] == ("left_route" if has_event else "more than 4 m")
+            passed += found.verdict == "non-inferior"
+            assert found.beyond.diff == pytest.approx(np.mean(far))
+            assert found.beyond.event == ("left_route" if has_event else "more than 4 m")
     assert passed <= 2

@@ -1,4 +1,4 @@
-"""Make run folders as the runtime writes them, with drives and pictures made up from a seed, so
+"""Make run folders by the runtime's own writers, with drives and pictures made up from a seed, so
 that the report can be tested alone.
 """
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from scipy.interpolate import CubicSpline
 
-from alpasim_plugin.log.run_folder.sides import RolloutTable
+from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.schema import rollout_folder, slug
+from alpasim_plugin.log.run_folder.writer import write_steps
+from alpasim_plugin.runs.summary import write_summary
 from evaluators.pages.flips import find_flips
 from evaluators.statistics.opening import read_run
-from evaluators.statistics.summary import by_policy, censoring, numbers
 
 METRICS = (
     "collision_any",
@@ -73,27 +73,20 @@ def make_run(folder, plan=None):
     folder.mkdir(parents=True, exist_ok=True)
     maps = {scene: _scene(scene, index, plan) for index, scene in enumerate(plan.scenes)}
     for scene, content in maps.items():
-        _json(folder / "scenes" / f"{_slug(scene)}.json", content)
-    rows = []
-    steps = []
+        _json(folder / "scenes" / f"{slug(scene)}.json", content)
+    manifests = []
     for scene, content in maps.items():
         for seed in plan.seeds:
             wander = _smooth(rng, plan.steps) * 0.3  # shared by the renderers: pairs are sharp
             for renderer in plan.renderers:
                 for policy in plan.policies:
-                    row, series = _rollout(
+                    manifest, steps = _rollout(
                         renderer, policy, scene, seed, content, wander, plan, rng
                     )
-                    rows.append(row)
-                    steps += series
-                    _files(folder, row, content, plan)
-    _write_rows(folder, rows)
-    _write_steps(folder, steps)
-    _json(folder / "run.json", _run_json(plan, maps))
-    _json(
-        folder / "summary.json",
-        summary_of(rows, plan, RolloutTable.of_files([folder / "rollouts.parquet"])),
-    )
+                    manifests.append(_written(folder, manifest, steps, plan))
+    info = _run_json(plan, maps, manifests)
+    write_run_json(folder, info)
+    write_summary(folder, info, manifests, folder)
     if plan.flip_frames:
         _write_flips(folder, plan)
     return folder
@@ -142,10 +135,6 @@ def _write_flips(folder, plan):
             "cells": cells,
         },
     )
-
-
-def _slug(name):
-    return "".join(c if c.isalnum() or c in "._@+-" else "-" for c in name).strip("-.") or "unnamed"
 
 
 def _json(path, value):
@@ -218,25 +207,22 @@ def _cubic(knots, n):
 
 def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type: ignore[no-untyped-def]
     key = {"renderer": renderer, "policy": policy, "scene": scene, "seed": seed}
-    row = key | {
-        "path": f"rollouts/{_slug(renderer)}/{_slug(policy)}/{_slug(scene)}/{seed}",
+    manifest = key | {
+        "path": rollout_folder(renderer, policy, scene, seed).as_posix(),
         "wall_s": round(float(rng.uniform(2.0, 6.0)), 3),
         "frames": plan.steps,
         "steps": plan.steps,
         "status": "ok",
-        "failure_class": None,
-        "failure": None,
+        "events": [],
+        "metrics": {},
     }
     if (renderer, scene, seed) in plan.fail:
-        row |= {
-            "status": "failed",
+        error = {
+            "message": plan.failure,
+            "hint": "run with --set guard=off",
             "failure_class": "renderer",
-            "failure": plan.failure,
-            "frames": 34,
-            "steps": 34,
         }
-        row |= {m: None for m in METRICS} | {f"{m}_valid": False for m in METRICS}
-        return row, []
+        return manifest | {"status": "failed", "error": error, "frames": 34, "steps": 34}, []
     harm = plan.harm.get(renderer, 0.8) * (1.6 if "hard" in scene else 1.0)
     t = np.arange(plan.steps)
     offset = (wander * (0.6 + harm) + _smooth(rng, plan.steps) * 0.12 * harm) * np.clip(
@@ -309,26 +295,44 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
         for m in ("min_ade@1.0s(gt)",)
         if values[m] is None
     ]
-    row["censored"] = {
-        "dropped": "",
-        "steps_total": plan.steps,
-        "steps_warmup": 5,
-        "steps_after_event": plan.steps - end,
+    slow = 14.0 + 9.0 * plan.renderers.index(renderer)
+    manifest |= {
+        "censored": {
+            "dropped": "",
+            "steps_total": plan.steps,
+            "steps_warmup": 5,
+            "steps_after_event": plan.steps - end,
+            "steps_after_drift": 0,
+            "steps_scored": end - 5,
+        },
+        "stage_ms": {
+            stage: (slow * share * np.linspace(0.9, 1.2, plan.steps)).tolist()
+            for stage, share in STAGES.items()
+        },
     }
-    row["censored"] |= {"steps_after_drift": 0, "steps_scored": end - 5}
-    row |= {f"{m}_reason": "no other road user within 50 m" for m in plan.invalid}
-    row |= {"min_ade@1.0s(gt)_reason": "the policy gives no plan of 1.0 s"}
-    row |= values | {f"{m}_valid": v is not None for m, v in values.items()}
-    return row, steps
+    reasons = dict.fromkeys(plan.invalid, "no other road user within 50 m")
+    reasons["min_ade@1.0s(gt)"] = "the policy gives no plan of 1.0 s"
+    manifest["metrics"] = {
+        name: {
+            "value": value,
+            "valid": value is not None,
+            "reason": reasons[name] if value is None else "",
+        }
+        for name, value in values.items()
+    }
+    return manifest, steps
 
 
-def _files(folder, row, content, plan):
-    place = folder / row["path"]
+def _written(folder, manifest, steps, plan):
+    """Write a rollout's folder as the runtime does, and return its manifest."""
+    place = folder / manifest["path"]
     place.mkdir(parents=True, exist_ok=True)
-    manifest = {"status": row["status"], "path": row["path"], "events": []}
-    _json(place / "manifest.json", manifest)
-    if plan.clips and row["status"] == "ok" and row["seed"] == plan.seeds[0]:
-        (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
+    if manifest["status"] == "ok":
+        write_steps(place, steps)
+        if plan.clips and manifest["seed"] == plan.seeds[0]:
+            (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
+    write_manifest(place, manifest)
+    return manifest
 
 
 def _picture(renderer, k, width, height):
@@ -345,80 +349,17 @@ def _picture(renderer, k, width, height):
     return image
 
 
-CELL = dict.fromkeys(("renderer", "policy", "scene"), pa.string()) | {"seed": pa.int64()}
-
-
-def _write(path, rows, fields):
-    pq.write_table(pa.Table.from_pylist(rows, schema=pa.schema(CELL | fields)), path)
-
-
-def _write_rows(folder, rows):
-    fields = dict.fromkeys(("status", "failure_class", "failure", "path"), pa.string())
-    fields |= {"wall_s": pa.float64(), "frames": pa.int64(), "steps": pa.int64()}
-    for name in METRICS:
-        fields |= {name: pa.float64(), f"{name}_valid": pa.bool_()}
-    _write(folder / "rollouts.parquet", rows, fields)
-
-
-def _write_steps(folder, steps):
-    fields = {"t_us": pa.int64(), "metric": pa.string(), "value": pa.float64()}
-    _write(folder / "steps.parquet", steps, fields | {"valid": pa.bool_(), "reason": pa.string()})
-
-
-def summary_of(rows, plan, table):
-    """Aggregate as the runtime does."""
-    own = {policy: [r for r in rows if r["policy"] == policy] for policy in plan.policies}
-    failed = [r for r in rows if r["status"] != "ok"]
-    speed = {
-        renderer: {
-            "ms_per_frame_p50": 14.0 + 9.0 * k,
-            "ms_per_frame_mean": 15.0 + 9.5 * k,
-            "ms_per_frame_p95": 19.0 + 13.5 * k,
-            "frames_per_s": 1000 / (15.0 + 9.5 * k),
-            "first_frame_ms": 310.0 + 80 * k,
-            "stages": {
-                s: {
-                    "p50_ms": round(share * (14.0 + 9 * k), 3),
-                    "p95_ms": round(share * (19.0 + 13 * k), 3),
-                    "share": share,
-                }
-                for s, share in STAGES.items()
-                if share
-            },
-        }
-        for k, renderer in enumerate(plan.renderers)
-        if rows
-    }
+def _run_json(plan, maps, manifests):
     return {
-        "preset": "paper",
-        **(numbers(table, bases={"onefixer": "3dgs"}) if rows else {"metrics": {}}),
-        "censoring": by_policy(own, censoring),
-        "failures": {
-            "n_failed": len(failed),
-            "n_rollouts": len(rows),
-            "by_class": {"renderer": len(failed)},
-            "cells": [_failed(r) for r in failed],
-        },
-        "speed": by_policy(dict.fromkeys(own), lambda _: speed),
+        "key": "made",
+        "bases": {"onefixer": "3dgs"} if "onefixer" in plan.renderers else {},
         "pool": {
             "workers": 2,
             "threads_per_worker": 1,
+            "frames": sum(manifest["frames"] for manifest in manifests),
             "frames_per_s_total": 41.2,
-            "wall_s": sum(r["wall_s"] for r in rows) / 2,
+            "wall_s": sum(manifest["wall_s"] for manifest in manifests) / 2,
         },
-    }
-
-
-def _failed(row):
-    error = {
-        "message": f"camera front <script>: {row['failure']}",
-        "hint": "run with --set guard=off",
-    }
-    return {k: row[k] for k in ("renderer", "policy", "scene", "seed", "path")} | {"error": error}
-
-
-def _run_json(plan, maps):
-    return {
         "schema_version": 1,
         "command": [
             "simrun",

@@ -20,6 +20,7 @@ from evaluators.pages.ci import write_summary_md
 from evaluators.pages.html import write_report
 from evaluators.pages.overview import decided, overview_of, tone_of
 from evaluators.pages.terminal import overview_lines
+from evaluators.results import Difference, Endings
 from evaluators.statistics.numbers import DASH
 from evaluators.statistics.opening import read_run
 from tests.pages.make_run import Plan, make_run
@@ -28,19 +29,17 @@ PRIMARY = METRICS.primary
 
 
 def pair(diff, low, high, verdict, **more):
-    entry = {"baseline": "clean", "diff": diff, "ci95": [low, high], "p_value": 0.01}
-    return entry | {"verdict": verdict, "margin": 0.02, "n_scenes": 3} | more
+    facts = {"baseline": "clean", "diff": diff, "ci95": (low, high), "p_value": 0.01}
+    facts |= {"unit": "", "direction": "lower", "verdict": verdict, "margin": 0.02}
+    return Difference(**facts | {"n_cells": 9, "n_scenes": 3} | more)
 
 
-def with_pairs(folder, **tables):
-    """Return a run of one policy with these tables of primary differences."""
+def with_pairs(folder, **entries):
+    """Return a run of one policy with these primary differences."""
     run = read_run(folder)
-    shown = {
-        name: {variant: {PRIMARY: entry} for variant, entry in table.items()}
-        for name, table in tables.items()
-    }
-    rest = {key: value for key, value in run.summary.items() if not key.startswith("paired")}
-    return dataclasses.replace(run, summary=rest | shown)
+    paired = {variant: {PRIMARY: entry} for variant, entry in entries.items()}
+    summary = dataclasses.replace(run.summary, paired=paired, paired_with_base={})
+    return dataclasses.replace(run, summary=summary)
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +106,8 @@ def test_a_terminal_narrower_than_the_plot_shows_every_difference(three, width):
 def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
     three,
 ):
-    entry = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
-    run = with_pairs(three, paired={"3dgs": entry, "onefixer": entry | {"more_scenes": 180}})
+    few = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
+    run = with_pairs(three, **{"3dgs": few, "onefixer": dataclasses.replace(few, more_scenes=180)})
     shown = overview_of(run)
     assert [row.difference and row.difference.tone for row in shown.rows] == [
         None,
@@ -123,7 +122,7 @@ def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal
 def test_what_is_decided_is_named_beside_what_is_not(three):
     run = with_pairs(
         three,
-        paired={
+        **{
             "3dgs": pair(0.25, 0.1, 0.4, "worse"),
             "onefixer": pair(0.0, -0.1, 0.1, "undecided", p_value=1.0),
         },
@@ -154,32 +153,37 @@ def test_with_several_policies_a_renderer_is_compared_with_the_baseline_of_its_o
 
 def test_a_distance_that_an_event_cut_short_says_so(three):
     run = read_run(three)
-    ledger = {name: {"steps_after_event": 5 * (name == "3dgs")} for name in run.renderers}
-    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"censoring": ledger}))
+    ledgers = {
+        name: dataclasses.replace(entry, steps_after_event=5 * (name == "3dgs"))
+        for name, entry in run.summary.censoring.items()
+    }
+    summary = dataclasses.replace(run.summary, censoring=ledgers)
+    shown = overview_of(dataclasses.replace(run, summary=summary))
     assert [row.is_cut_short for row in shown.rows] == [False, True, False]
     assert [shown.cells(row)[-2].endswith("*") for row in shown.rows] == [False, True, False]
 
 
 @pytest.mark.parametrize(
-    ("entry", "tone"),
+    ("verdict", "difference", "tone"),
     [
-        ({"verdict": "undecided"}, "unclear"),
-        ({"verdict": "undecided", "difference": "worse"}, "worse"),
-        ({"verdict": "non-inferior", "difference": "worse"}, "neutral"),
-        ({"verdict": "non-inferior", "difference": "better"}, "better"),
-        ({"verdict": "worse"}, "worse"),
+        ("undecided", None, "unclear"),
+        ("undecided", "worse", "worse"),
+        ("non-inferior", "worse", "neutral"),
+        ("non-inferior", "better", "better"),
+        ("worse", None, "worse"),
     ],
 )
-def test_tone_of_a_difference(entry, tone):
-    assert tone_of(entry) == tone
+def test_tone_of_a_difference(verdict, difference, tone):
+    assert tone_of(pair(0.1, 0.0, 0.2, verdict, difference=difference)) == tone
 
 
 @pytest.mark.parametrize(("failed", "tone"), [({}, "unclear"), ({"off-road": 1}, "worse")])
 def test_the_headline_counts_rollouts_that_do_not_reach_the_end(three, failed, tone):
     run = read_run(three)
-    entry = {"n_rollouts": 2, "outcomes": {}, "endings": {"end not reached": 2}}
-    table = {"clean/a": entry, "clean/b": entry | {"endings": entry["endings"] | failed}}
-    shown = overview_of(dataclasses.replace(run, summary=run.summary | {"outcomes": table}))
+    short = Endings(2, 2, 0, 0, endings={"end not reached": 2}, outcomes={})
+    other = dataclasses.replace(short, endings=short.endings | failed)
+    summary = dataclasses.replace(run.summary, outcomes={"clean/a": short, "clean/b": other})
+    shown = overview_of(dataclasses.replace(run, summary=summary))
     assert shown.badge[1] == tone
     assert f" 4 of {4 + len(failed)}\u00a0rollouts" in shown.badge[0]
 

@@ -12,8 +12,10 @@ import numpy as np
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_table
-from evaluators import aggregate
+from evaluators.results import Failures, Summary, to_json
+from evaluators.statistics.summary import numbers
 
 COMMITS = ("3f2a9c1d" * 5, "8b07ee42" * 5, "c51d9a60" * 5)
 METRICS = ("offroad", "lateral_distance_m", "progress")
@@ -50,20 +52,10 @@ def make_one(root, one):
     rows = rows_of(one)
     write_run_json(folder, info_of(one) | {"outcome": {"n_rollouts": len(rows), "n_failed": 0}})
     write_table(folder / "rollouts.parquet", rows, ROLLOUTS_TABLE.arrow(METRICS))
-    metrics = {}
-    for policy in one.policies:
-        found = aggregate([row for row in rows if row["policy"] == policy])
-        metrics |= (
-            found
-            if len(one.policies) == 1
-            else {f"{renderer}/{policy}": table for renderer, table in found.items()}
-        )
-    summary = {
-        "preset": one.preset,
-        "metrics": metrics,
-        "failures": {"n_rollouts": len(rows), "n_failed": 0, "by_class": {}, "cells": []},
-    }
-    write_json(folder / "summary.json", summary)
+    means = numbers(RolloutTable.of_files([folder / "rollouts.parquet"]))
+    failures = Failures(n_failed=0, n_rollouts=len(rows), by_class={})
+    summary = Summary(preset=one.preset, failures=failures, **vars(means))
+    write_json(folder / "summary.json", to_json(summary))
     return folder
 
 

@@ -1,6 +1,5 @@
 """Several runs aggregated as one: parts of a night give what the whole night gives."""
 
-import json
 from dataclasses import replace
 
 import pyarrow.compute as pc
@@ -9,6 +8,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.runs.summary import aggregate_runs
+from evaluators.results import read_summary
 from tests.runs.make_many import SCENES, Many, make_one
 
 
@@ -31,14 +31,13 @@ def night(tmp_path_factory):
 def test_the_parts_of_a_night_give_the_numbers_of_the_whole(night):
     whole = aggregate_runs([night / "whole"])
     # All six scenes differ by exactly 0.4 m: there is no spread to go by.
-    assert whole["paired"]["onefixer"]["lateral_distance_m"]["verdict"] == "undecided"
+    assert whole.paired["onefixer"]["lateral_distance_m"].verdict == "undecided"
     parts = aggregate_runs([night / "part-1", night / "part-2"])
     for block in ("preset", "paired", "failures"):
-        assert parts[block] == whole[block]
-    stored = json.loads((night / "whole" / "summary.json").read_text())[
-        "metrics"
-    ]  # as a run of all rollouts wrote it
-    assert parts["metrics"] == whole["metrics"] == stored
+        assert getattr(parts, block) == getattr(whole, block)
+    # As a run of all rollouts wrote it.
+    stored = read_summary(night / "whole" / "summary.json", "").metrics
+    assert parts.metrics == whole.metrics == stored
 
 
 def test_runs_that_do_not_belong_together_are_refused(night, tmp_path):

@@ -73,9 +73,9 @@ def origins(root):
 def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
     plan = plan_of()
     summary, _ = drive(plan, tmp_path / "run")
-    assert summary["copies"] == 2
-    paired = summary["paired"][DARKER]
-    assert {one["diff"] for one in paired.values()} <= {0.0, None}
+    assert summary.copies == 2
+    paired = summary.paired[DARKER]
+    assert {one.diff for one in paired.values()} <= {0.0, None}
     for cell in plan.cells[1::2]:
         copied = read_manifest(tmp_path / "run" / cell.folder)
         driven = run_cell(cell, plan.options, tmp_path / "alone", 1)
@@ -143,7 +143,7 @@ def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(t
 def test_a_rollout_that_failed_is_not_copied(tmp_path):
     plan = plan_of("tests.runs.broken_policies:Raises")
     summary, _ = drive(plan, tmp_path)
-    assert (summary["copies"], summary["failures"]["n_failed"]) == (0, 4)
+    assert (summary.copies, summary.failures.n_failed) == (0, 4)
 
 
 def test_the_first_renderer_drives_and_another_one_alone_drives_itself(tmp_path):

@@ -27,7 +27,7 @@ def plan_of(policies, *overrides):
 def repeated(plan, root):
     result = execute_run(plan, root, 1, ["simrun"], Announced(), repeat=True, report=False)
     found = json.loads((root / "run.json").read_text())["repeat"]
-    assert result.summary["repeat"] == found
+    assert result.summary.repeat == found
     assert not list(root.glob("*repeat*"))
     return found
 

@@ -76,7 +76,7 @@ def test_a_failing_policy_is_the_policys_fault_and_not_driven_again_unasked(tmp_
     )
     result, _ = run(plan, tmp_path)
     assert (result.n_rollouts, result.n_failed, result.exit_code) == (4, 2, 2)
-    assert result.summary["failures"]["by_class"] == {"policy": 2}
+    assert result.summary.failures.by_class == {"policy": 2}
     rows = pq.read_table(tmp_path / "rollouts.parquet").to_pylist()
     assert {row["failure_class"] for row in rows if row["policy"] == broken} == {"policy"}
     assert all(row["collision_any"] is None for row in rows if row["policy"] == broken)

@@ -48,9 +48,9 @@ def test_means_of_many_runs_are_those_of_their_summaries(repo, run):
     found = {(Path(row["filename"]).parent.name, row["renderer"]): row for row in rows(repo, 0)}
     assert set(found) == {("mine", "clean"), ("mine", "3dgs"), ("other", "clean")}
     for (name, renderer), row in found.items():
-        held = read_run(Path("runs", name)).summary["metrics"][renderer]
+        held = read_run(Path("runs", name)).summary.metrics[renderer]
         failed = 1 if (name, renderer) == ("mine", "3dgs") else 0
         assert (row["ran"], row["failed"]) == (6 - failed, failed)
         for metric in ("offroad", "lateral_distance_m"):
-            assert row[metric] == pytest.approx(held[metric]["mean"], rel=1e-12)
-        assert row["valid"] == held["lateral_distance_m"]["n_rollouts"]
+            assert row[metric] == pytest.approx(held[metric].mean, rel=1e-12)
+        assert row["valid"] == held["lateral_distance_m"].n_rollouts

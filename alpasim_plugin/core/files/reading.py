@@ -34,7 +34,7 @@ from alpasim_plugin.core.files.limits import (
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 
 if TYPE_CHECKING:
-    from pydantic import TypeAdapter
+    from pydantic import TypeAdapter, ValidationError
 
 CHECK_PATH = "check the path and its permissions"
 FETCH_AGAIN = "fetch or write the file again; it may be damaged"
@@ -269,12 +269,38 @@ def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str = FETCH
     try:
         _adapter(cast(Hashable, shape)).validate_python(value, strict=True)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        member = ".".join(str(part) for part in first["loc"]) or "the document"
-        found = f"{kind_of(first['input'])}, wanted {wanted_of(first)}"
-        found = "missing" if first["type"] == "missing" else found
-        raise InputError(f"{where}: {member}: {found}", do_this) from None
+        raise InputError(f"{where}: {_first_problem(error)}", do_this) from None
     return cast("T", value)
+
+
+def read_record(record: type[T], data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> T:
+    """Return the record that a JSON document holds.
+
+    Args:
+        record: A frozen dataclass; its members may be dataclasses, dictionaries and tuples of them.
+            Types are strict. Members of the document that it does not name are not looked at.
+        data: The document, as `parse_json` accepts it.
+        where: Its file, for messages.
+        do_this: Hint of the error.
+
+    Raises:
+        InputError: The first member that is missing or of another type, by its path.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return cast("T", _adapter(cast(Hashable, record)).validate_json(data, strict=True))
+    except ValidationError as error:
+        raise InputError(f"{where}: {_first_problem(error)}", do_this) from None
+
+
+def _first_problem(error: ValidationError) -> str:
+    """Say which member is missing or has another type than it should."""
+    first = error.errors(include_url=False)[0]
+    member = ".".join(str(part) for part in first["loc"]) or "the document"
+    if first["type"] == "missing":
+        return f"{member}: missing"
+    return f"{member}: {kind_of(first['input'])}, wanted {wanted_of(first)}"
 
 
 WANTED = {  # type of a problem that pydantic finds -> what it wants instead
@@ -289,6 +315,7 @@ WANTED = {  # type of a problem that pydantic finds -> what it wants instead
     "list_type": "a list",
     "tuple_type": "a list",
     "dict_type": "an object of keys and values",
+    "dataclass_type": "an object of keys and values",
     "model_type": "an object of keys and values",
     "greater_than": "a number greater than {gt:g}",
     "greater_than_equal": "a number greater than or equal to {ge:g}",

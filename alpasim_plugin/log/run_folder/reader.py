@@ -36,7 +36,6 @@ from alpasim_plugin.log.run_folder.schema import (
     MANIFEST,
     ROLLOUTS,
     ROLLOUTS_TABLE,
-    RUN_INFO,
     SCENES,
     STEPS,
     STEPS_NAME,
@@ -44,7 +43,7 @@ from alpasim_plugin.log.run_folder.schema import (
     SUMMARY,
     metrics_in,
 )
-from alpasim_plugin.log.run_folder.shapes import RunInfo, SceneFile, Summary
+from alpasim_plugin.log.run_folder.shapes import SceneFile
 from alpasim_plugin.log.run_folder.writer import rollout_table
 
 TRACEBACK_LINES = 3
@@ -66,7 +65,6 @@ class Run:
 
     Attributes:
         info: ``run.json``.
-        summary: ``summary.json``; empty where the run is not finished.
         rollouts: Rows of ``rollouts.parquet``.
         metric_names: Rollout metrics in the column order of ``rollouts.parquet``.
         planned: Rollouts in all, of an unfinished run.
@@ -75,7 +73,6 @@ class Run:
 
     folder: Path
     info: JsonView
-    summary: JsonView
     rollouts: Sequence[Rollout]
     metric_names: tuple[str, ...]
     planned: int = 0
@@ -86,19 +83,17 @@ class Run:
         """Read a run folder.
 
         Raises:
-            InputError: ``run.json``, ``rollouts.parquet`` or ``summary.json`` is absent or
-                unreadable, or the table is not as `ROLLOUTS_TABLE` says.
+            InputError: ``run.json`` or ``rollouts.parquet`` is absent or unreadable, or the table
+                is not as `ROLLOUTS_TABLE` says.
         """
-        info: JsonView = read_json_as(RunInfo, folder / RUN_INFO, do_this=AGAIN)
-        summary: JsonView = read_json_as(Summary, table_path(folder, SUMMARY), do_this=AGAIN)
+        info = read_run_json(folder)
         path = table_path(folder, ROLLOUTS)
         rows = StoredRollouts(path)
-        return cls(folder, info, summary, rows, metrics_in(ROLLOUTS_TABLE.check(path)))
+        return cls(folder, info, rows, metrics_in(ROLLOUTS_TABLE.check(path)))
 
     @classmethod
     def read_so_far(cls, root: Path) -> Self:
-        """Read a run folder that may be unfinished: then with the finished rollouts alone, and
-        without a summary.
+        """Read a run folder that may be unfinished: then with the finished rollouts alone.
 
         Raises:
             InputError: It holds no run, or its description or its tables are damaged.
@@ -113,7 +108,6 @@ class Run:
         return cls(
             root,
             read_run_json(root),
-            {},
             rollouts_of_table(table),
             metrics_in(table.column_names),
             len(found.cells),
@@ -137,13 +131,6 @@ class Run:
 
     def _in_order(self, axis: str, seen: Iterable[str]) -> list[str]:
         return list(dict.fromkeys([*(self.info.get(axis) or ()), *seen]))
-
-    @property
-    def variants(self) -> list[str]:
-        """List the columns of the result tables: the keys under which ``summary.json`` holds
-        metrics.
-        """
-        return list(self.summary.get("metrics") or {}) or self.renderers
 
     def rollouts_of(self, variant: str) -> list[Rollout]:
         """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""
@@ -251,8 +238,8 @@ class Run:
 
     @cached_property
     def invalid_reasons(self) -> dict[tuple[str, str], str]:
-        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason,
-        from the ledger or else the steps.
+        """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason of
+        the steps.
         """
         columns = ["renderer", "metric", "reason"]
         table = self._read_steps(
@@ -260,13 +247,7 @@ class Run:
         )
         counts = table.group_by(columns).aggregate([([], "count_all")]).sort_by("count_all")
         rows = counts.to_pylist()  # ascending: the most frequent reason is written last
-        found = {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
-        for renderer, ledger in (self.summary.get("censoring") or {}).items():
-            for metric, entry in (ledger.get("invalid") or {}).items():
-                reasons = entry.get("reasons") or {}
-                if reasons:
-                    found[renderer, metric] = max(reasons, key=lambda reason: reasons[reason])
-        return found
+        return {(row["renderer"], row["metric"]): row["reason"] for row in rows if row["reason"]}
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.log.run_folder.checksums import FileFacts
 
@@ -92,23 +91,6 @@ class ManifestFile(TypedDict):
     status: str
 
 
-class Summary(TypedDict, total=False):
-    """``summary.json``."""
-
-    preset: str
-    outcomes: dict[str, Facts]
-    metrics: dict[str, dict[str, Facts]]
-    paired: dict[str, dict[str, Facts]]
-    paired_with_base: dict[str, dict[str, Facts]]
-    paired_policies: dict[str, dict[str, Facts]]
-    censoring: dict[str, Facts]
-    failures: Facts
-    speed: dict[str, Facts]
-    pool: Facts
-    fixers: dict[str, Facts]
-    plans: dict[str, Facts]
-
-
 class MapLane(TypedDict):
     """A lane of ``scenes/SCENE.json``: types of its left and right marking, and its lines."""
 
@@ -127,13 +109,3 @@ class SceneFile(TypedDict, total=False):
     ego_log: dict[str, list[Coordinate] | list[int]]
     vehicle: dict[str, Coordinate]
     actors: list[Facts]
-
-
-def pair_tables(summary: JsonView) -> list[tuple[str, JsonView]]:
-    """List the tables of paired differences with the variant of each: renderers, fixers against
-    their base, then policies.
-    """
-    tables = []
-    for key in ("paired", "paired_with_base", "paired_policies"):
-        tables += [item for item in (summary.get(key) or {}).items() if item[1]]
-    return tables

@@ -233,9 +233,13 @@ class RolloutTable:
         return cls(data, where, reasons)
 
     @classmethod
-    def of_table(cls, table: pa.Table) -> RolloutTable:
+    def of_table(
+        cls,
+        table: pa.Table,
+        reasons: Callable[[str, str], str] = lambda renderer, metric: "",
+    ) -> RolloutTable:
         """Take a table in memory."""
-        return cls(table, "a table of rollouts")
+        return cls(table, "a table of rollouts", reasons)
 
     def sides(self, policy: str, named: str | None = None) -> dict[str, Side]:
         """Return RENDERER -> its rollouts with a policy, in order of appearance.
