@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.results import MissingPair, Verdict
