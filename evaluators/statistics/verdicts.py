@@ -12,7 +12,7 @@ import scipy  # its submodules load on first use; scipy.stats would take a secon
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Direction
-from evaluators.results import Bounds, Cause, Contrast, Failures, Outcome, Verdict
+from evaluators.results import EXIT_CODES, Bounds, Cause, Contrast, Failures, Outcome, Verdict
 from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
 
 # Where causes meet, the first one found here decides: numbers from an incomplete run may mislead
