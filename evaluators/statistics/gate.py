@@ -336,7 +336,7 @@ def check_gate(
         kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
         name = f"{kind}{base.name} of the same run"
     about = SCENES if spec.population == "scenes" else SUITE[repeatable]
-    accepts_failures = failures["n_failed"] > 0 and of_failures.cause == "pass"
+    accepts_failures = failures.n_failed > 0 and of_failures.cause == "pass"
     return GateVerdict(worst(outcomes), tuple(checks), failures, name, about, accepts_failures)
 
 
