@@ -18,6 +18,7 @@ from alpasim_plugin.core.types import RolloutLog
 from alpasim_plugin.log import encode_image, read_asl
 from alpasim_plugin.log.debug import WIDTH_PX
 from alpasim_plugin.log.images import smaller
+from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
 from alpasim_plugin.runs.cameras import logged_request
 from alpasim_plugin.runs.guards import checked_frames
@@ -39,12 +40,17 @@ def store_same_poses(
 
     A renderer that works in blocks of frames, or that fails, is left out.
     """
+    if len(plan.renderers) < 2:
+        return
     cells = {cell.folder.as_posix(): cell for cell in plan.cells}
-    failures = [one for one in manifests if one["status"] == "ok" and first_failure(one)]
-    for manifest in failures[:MOST_FAILURES] if len(plan.renderers) > 1 else ():
+    # As they are stored: with the digests of the rollouts' files, which belong to the key.
+    stored = [read_manifest(root / manifest["path"]) for manifest in manifests]
+    failures = [manifest for manifest in stored if manifest["status"] == "ok"]
+    failures = [manifest for manifest in failures if first_failure(manifest)]
+    for manifest in failures[:MOST_FAILURES]:
         cell = cells[manifest["path"]]
         path = root / cell.folder / SAME_POSES
-        key = images_key(plan, cell, manifest, manifests)
+        key = images_key(plan, cell, manifest, stored)
         if _key_in(path) == key:
             continue
         log = read_asl(root / cell.folder / LOG_NAME)

@@ -1,0 +1,26 @@
+"""A run with several renderers keeps what each of them shows before a failure."""
+
+from alpasim_plugin.core.files import read_json
+from alpasim_plugin.log.run_folder.schema import SAME_POSES
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.run import execute_run
+from scenarios.suite import expand
+from tests.runs.grey_policy import BY_GREY
+from tests.runs.grey_renderer import GREY
+from tests.runs.short_runs import Announced
+
+DARKER = "tests.runs.grey_renderer:Darker"
+
+
+def test_images_of_the_other_renderer_are_stored_beside_a_failure(tmp_path):
+    """The darker images steer the policy off the road."""
+    refs = expand("smoke/straight", ("timing.duration_us=4000000",))
+    plan = make_plan(refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions())
+    root = tmp_path / "run"
+    execute_run(plan, root, 1, ["simrun"], Announced(), report=False)
+    files = sorted(root.glob(f"rollouts/**/{SAME_POSES}"))
+    assert files
+    for file in files:
+        content = read_json(file)
+        assert content["key"]
+        assert [len(images) > 0 for images in content["images"].values()] == [True]
