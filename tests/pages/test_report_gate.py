@@ -14,6 +14,7 @@ from evaluators.pages import html
 from evaluators.pages.ci import write_gate_files
 from evaluators.pages.gate import gate_section, worst_of
 from evaluators.pages.overview import overview_of
+from evaluators.results import Failures
 from evaluators.statistics.baselines import table_of_run
 from evaluators.statistics.gate import GateVerdict, check_gate, load_gate
 from evaluators.statistics.opening import read_run
@@ -62,7 +63,7 @@ def test_junit_is_red_for_failed_rollouts_only_where_the_gate_is(
     run = replace(run, rollouts=[failed, *run.rollouts[1:]])
     n_failed = sum(not rollout.ok for rollout in run.rollouts)
     n_rollouts = len(run.rollouts)
-    failures = {"n_failed": n_failed, "n_rollouts": n_rollouts, "by_class": {"renderer": n_failed}}
+    failures = Failures(n_failed, n_rollouts, {"renderer": n_failed})
     outcome = outcome_of_failures(failures, max_failed)
     verdict = GateVerdict(outcome, (), failures, "before", "", accepts_failures=not is_red)
     file = write_gate_files(verdict, "gate", run, tmp_path / "files")[1]
