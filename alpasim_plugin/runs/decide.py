@@ -49,12 +49,15 @@ SCENES_PER_LOOK = 5
 ORDER_SEED = 0
 
 
-def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
+def plan_of_two(
+    plan: RunPlan, question: Question, scenes_per_look: int = SCENES_PER_LOOK
+) -> RunPlan:
     """Return the part of a plan that a question is about: the baseline and one other variant.
 
     Args:
         plan: Of two renderers or two policies, or of two of each with a baseline that names both.
         question: What is to be decided; its digest goes into the plan.
+        scenes_per_look: How many scenes are driven between two analyses; part of that digest.
 
     Raises:
         InputError: The plan has another number of variants, or too few scenes for the good answer.
@@ -84,7 +87,7 @@ def plan_of_two(plan: RunPlan, question: Question) -> RunPlan:
         )
     kept = {(variant.renderer, variant.policy) for variant in variants}
     cells = tuple(cell for cell in plan.cells if (cell.renderer.name, cell.policy.name) in kept)
-    key = digest([asdict(question), SCENES_PER_LOOK, ORDER_SEED])
+    key = digest([asdict(question), scenes_per_look, ORDER_SEED])
     options = replace(plan.options, baseline=base.name)
     return replace(plan, cells=cells, options=options, question=key)
 
@@ -101,13 +104,15 @@ def drawing_order(scenes: Sequence[str]) -> list[str]:
 @dataclass
 class SequentialTest:
     """The scenes driven so far, what follows from them, and which come next; a
-    `alpasim_plugin.runs.run.Search` of a plan from `plan_of_two`.
+    `alpasim_plugin.runs.run.Search` of a plan from `plan_of_two`, which has the same
+    ``scenes_per_look``.
     """
 
     kind: ClassVar[str] = "decide"
 
     plan: RunPlan
     question: Question
+    scenes_per_look: int = SCENES_PER_LOOK
     n_scenes: int = 0  # that were driven, the first of the order
     driven: dict[str, JsonObject] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
@@ -122,7 +127,7 @@ class SequentialTest:
         self.candidate = next(variant for variant in variants if base.of(variant) != variant)
         self.baseline = base.of(self.candidate)
         self.order = drawing_order(list(self.plan.scenarios))
-        self.ceiling, self.at_once = self.plan, SCENES_PER_LOOK * 2 * len(self.plan.seeds)
+        self.ceiling, self.at_once = self.plan, self.scenes_per_look * 2 * len(self.plan.seeds)
 
     def driven_plan(self) -> RunPlan:
         """Return the part of the plan that was driven."""
@@ -133,7 +138,7 @@ class SequentialTest:
         """Return the next batch; None where the test has ended, and then ``stopped`` says why."""
         if self.stopped:
             return None
-        batch = self.order[self.n_scenes : self.n_scenes + SCENES_PER_LOOK]
+        batch = self.order[self.n_scenes : self.n_scenes + self.scenes_per_look]
         if not batch:
             self.stopped = f"all {len(self.order)} scenes are driven"
             return None
@@ -194,7 +199,7 @@ class SequentialTest:
             "baseline": short_name(self.baseline, self.candidate),
             "policy": self.candidate.policy,
             "order_seed": ORDER_SEED,
-            "look_every": SCENES_PER_LOOK,
+            "look_every": self.scenes_per_look,
             "ceiling": {"scenes": len(self.order), "rollouts": len(self.plan.cells)},
             "order": self.order[: self.n_scenes],
             "looks": self.looks,

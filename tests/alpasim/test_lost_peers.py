@@ -95,7 +95,7 @@ def test_a_driver_killed_in_the_middle_is_an_infrastructure_failure_and_is_drive
         assert run_command(command) != 0
     (failed,) = json.loads(capsys.readouterr().out)["summary"]["failures"]["cells"]
     assert failed["error"]["failure_class"] == "infrastructure"
-    assert "of simulated time" in failed["error"]["message"]
+    assert "of simulated time: EgodriverService.drive failed: " in failed["error"]["message"]
     with driver(address):
         assert run_command([*command, "--resume"]) == 0
     assert json.loads(capsys.readouterr().out)["summary"]["failures"]["n_failed"] == 0
@@ -137,5 +137,6 @@ def test_only_what_a_driver_does_itself_is_its_own_fault(code, text, kind):
             )
         service.close()
     assert type(caught.value) is kind
-    assert f"{host.address}, at 1700000 us of simulated time" in caught.value.message
+    place = f"{host.address}, at 1700000 us of simulated time"
+    assert caught.value.message.startswith(f"{place}: EgodriverService.drive failed: {code}: ")
     assert not getattr(caught.value, "is_final", False) or kind is PolicyError

@@ -11,7 +11,6 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.schema import MANIFEST, SUMMARY
-from alpasim_plugin.runs import decide as decide_module
 from alpasim_plugin.runs.decide import SequentialTest, drawing_order, plan_of_two
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_search
@@ -19,7 +18,6 @@ from evaluators.pages.html import render_report
 from evaluators.statistics.decision import (
     DECISION,
     Question,
-    least_scenes,
     metric_question,
     read_decision,
 )
@@ -33,6 +31,7 @@ DARKER = GREY.replace("Grey", "Darker")
 SHORT = ("timing.duration_us=700000", "timing.warmup_us=100000")
 SAME = Question((metric_question("offroad", 0.6),), alpha=0.1)
 CLOSER = replace(SAME, alpha=0.001)
+SCENES_PER_LOOK = 2
 
 
 class Looks(Announced):
@@ -59,24 +58,19 @@ def plan_of(
     )
 
 
-def decide(root, question, plan, workers=1):
+def decide(root, question, plan):
+    return search(root, question, plan_of_two(plan, question, SCENES_PER_LOOK))
+
+
+def search(root, question, plan):
     announced = Looks()
-    test = SequentialTest(plan_of_two(plan, question), question)
-    execute_search(test, root, workers, ["simrun"], announced, report=False)
+    test = SequentialTest(plan, question, SCENES_PER_LOOK)
+    execute_search(test, root, 1, ["simrun"], announced, report=False)
     return test, announced
 
 
-@pytest.fixture(autouse=True, scope="module")
-def two_scenes_per_look():
-    """Look after every two scenes, and search among fewer scenes for how many would decide."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(decide_module, "SCENES_PER_LOOK", 2)
-        patch.setattr(decide_module, "least_scenes", lambda one, most=100: least_scenes(one, most))
-        yield
-
-
 @pytest.fixture(scope="module")
-def decided_run(tmp_path_factory, two_scenes_per_look):
+def decided_run(tmp_path_factory):
     """Drive until the darker renderer is shown to be non-inferior."""
     root = tmp_path_factory.mktemp("decided_run") / "run"
     return root, *decide(root, SAME, plan_of())
@@ -140,11 +134,10 @@ def test_a_damaged_record_is_refused(decided_run, tmp_path):
         read_decision(tmp_path)
 
 
-def test_when_all_scenes_are_driven_the_decision_is_undecided(tmp_path, monkeypatch):
+def test_when_all_scenes_are_driven_the_decision_is_undecided(tmp_path):
     with pytest.raises(InputError):
         decide(tmp_path, CLOSER, plan_of(2))
-    monkeypatch.setattr(decide_module, "least_scenes", lambda question, most: most)
-    decided, announced = decide(tmp_path, CLOSER, plan_of(2))
+    decided, announced = search(tmp_path, CLOSER, plan_of(2))
     assert (decided.outcome.exit_code, decided.record()["rollouts"]) == (3, 4)
     assert announced.looks == [(2, "open")]
 
@@ -177,7 +170,8 @@ def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path, capsys)
         ["--renderer", f"{GREY},{DARKER}", "--metric", "progress=much"],
         ["--renderer", f"{GREY},{DARKER}", "--metric", "progress=-1"],
         ["--renderer", f"{GREY},{DARKER}", "--metric", "progress", "--metric", "progress"],
-        ["--renderer", f"{GREY},{DARKER}"],  # the default gate wants more scenes
+        # The default gate wants more scenes; the search for how many takes seconds.
+        pytest.param(["--renderer", f"{GREY},{DARKER}"], marks=pytest.mark.slow),
     ],
 )
 def test_questions_that_cannot_be_asked_are_refused_before_driving(words, tmp_path):
