@@ -1,8 +1,8 @@
 """Fixtures shared by all tests.
 
-Hypothesis draws few examples of each property by default, the same ones in every run. The full
-numbers, which stand beside the properties (`tests.examples`), are drawn with
-``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``.
+Hypothesis draws few examples of each property by default, and more in CI, the same ones in every
+run. The full numbers, which stand beside the properties (`tests.examples`), are drawn with
+``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``, others in every run.
 """
 
 import os
@@ -21,7 +21,7 @@ from tests.pages.browser import Browser, find_chromium
 
 pytest_plugins = ("tests.durations",)
 settings.register_profile(
-    PROFILE, derandomize=PROFILE == "quick", deadline=None, max_examples=examples(100)
+    PROFILE, derandomize=PROFILE != "nightly", deadline=None, max_examples=examples(100)
 )
 settings.load_profile(PROFILE)
 

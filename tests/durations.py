@@ -3,14 +3,24 @@
 `tests/durations.json`.
 
 Nothing fails for it. ``pytest --durations-file tests/durations.json`` keeps a new standard, which
-holds for one machine and one number of workers: CI's.
+holds for one machine and one number of workers: CI's. Slow tests have a standard of their own,
+`tests/durations_of_slow_tests.json`.
+
+``pytest --no-test-after SECONDS`` skips, with the reason, each test that would begin later than that
+after the session's start: CI's time has an end.
 """
 
 import json
+import os
+import time
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 KEPT = Path(__file__).with_name("durations.json")
+KEPT_OF_SLOW_TESTS = Path(__file__).with_name("durations_of_slow_tests.json")
+BEGAN = "SIMRUN_TESTS_BEGAN_S"  # the variable that tells workers when the session began
 FACTOR, LEAST_S = 1.5, 3.0  # a file is slower if it takes so many times as long, and so much longer
 seconds = defaultdict(float)  # by file, set-up and tear-down included
 
@@ -27,9 +37,13 @@ def slower(before, now):
     return [line for _, line in sorted(worse)]
 
 
-def kept_seconds():
-    """Return the seconds of each file as they were kept; none where nothing is."""
-    return json.loads(KEPT.read_text(encoding="utf-8")) if KEPT.exists() else {}
+def kept_seconds(config):
+    """Return the seconds of each file as they were kept for the tests that are selected; none where
+    nothing is.
+    """
+    is_slow = config.option.markexpr.replace("not slow", "").find("slow") >= 0
+    kept = KEPT_OF_SLOW_TESTS if is_slow else KEPT
+    return json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
 
 
 # A kernel's first call compiles it, for half a minute, and leaves it on disk for every later
@@ -42,9 +56,9 @@ FIRST = (
 )
 
 
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(items, config):
     """Put the files in the order in which workers take them."""
-    took_s = kept_seconds()
+    took_s = kept_seconds(config)
 
     def order_of(item):
         file = item.nodeid.partition("::")[0]
@@ -59,6 +73,24 @@ def pytest_addoption(parser):
         type=Path,
         help="write the seconds that each file of tests took here, and compare them",
     )
+    parser.addoption(
+        "--no-test-after",
+        type=float,
+        metavar="SECONDS",
+        help="skip each test that would begin later than this after the session's start",
+    )
+
+
+def pytest_configure(config):
+    if not hasattr(config, "workerinput"):  # workers inherit the start of the whole session
+        os.environ[BEGAN] = str(time.time())
+
+
+@pytest.hookimpl(tryfirst=True)  # before the marks are looked at
+def pytest_runtest_setup(item):
+    limit_s = item.config.getoption("--no-test-after")
+    if limit_s is not None and time.time() - float(os.environ[BEGAN]) > limit_s:
+        item.add_marker(pytest.mark.skip(reason=f"no time after {limit_s:g} s (--no-test-after)"))
 
 
 def pytest_runtest_logreport(report):
@@ -69,7 +101,7 @@ def pytest_terminal_summary(terminalreporter, config):
     file = config.getoption("--durations-file")
     if file is None:
         return
-    before = kept_seconds()
+    before = kept_seconds(config)
     now = {name: round(took, 1) for name, took in sorted(seconds.items())}
     file.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
     terminalreporter.section("files that became slower")

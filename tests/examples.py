@@ -1,7 +1,7 @@
 """How much of a property is tried in every run, and how much in the nightly one.
 
-Hypothesis draws few examples by default and all of them with ``SIMRUN_HYPOTHESIS=nightly``; further
-cases of one rule are marked ``slow``.
+Hypothesis draws few examples by default, a fifth of them in CI (``SIMRUN_HYPOTHESIS=ci``) and all of
+them with ``SIMRUN_HYPOTHESIS=nightly``; further cases of one rule are marked ``slow``.
 """
 
 import os
@@ -9,7 +9,7 @@ import os
 import pytest
 
 PROFILE = os.environ.get("SIMRUN_HYPOTHESIS", "quick")
-SHARE = {"quick": 0.05, "nightly": 1.0}[PROFILE]
+SHARE = {"quick": 0.05, "ci": 0.2, "nightly": 1.0}[PROFILE]
 FEWEST = 4
 
 
