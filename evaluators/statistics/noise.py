@@ -35,7 +35,7 @@ from evaluators.statistics.intervals import TAIL
 CUT_MARGINS = 3.0  # at which the harm of a cell is cut
 # A drive beyond the cut is no noise of a run whose other cells differ by so many times less: with the
 # heavy tails of t(3) it happens in half a percent of runs.
-APART = 5.0
+APART = 8.0
 RATE_LEVEL = 0.95  # of the printed rate of drives beyond the cut, one-sided
 OUTSIDE = 0.0005  # chance that the rate of gone events is none of them
 NUISANCE = 200  # rates of gone events at which the error of the test of events is computed
