@@ -287,7 +287,7 @@ def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[s
             steps.
     """
     step_us = float(str(root.get("timeStepSize"))) * 1e6  # the reader has checked it
-    found: dict[str, Cycle] = {}
+    cycles: dict[str, Cycle] = {}
     lights = root.findall("trafficLight")
     for light in lights:
         key = str(light.get("id"))
@@ -303,9 +303,9 @@ def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[s
                 if lasts_us <= 0:
                     raise ValueError(f"a duration of {lasts_us} us")
                 phases.append((COLOURS[str(part.findtext("color"))], lasts_us))
-            found[key] = tuple(phases), round(number(light, "cycle/timeOffset", 0.0) * step_us)
-    left_out = len(lights) - len(found)
-    return found, [
+            cycles[key] = tuple(phases), round(number(light, "cycle/timeOffset", 0.0) * step_us)
+    left_out = len(lights) - len(cycles)
+    return cycles, [
         f"{left_out} traffic lights are off, without a cycle or for some directions only, and are not used"
     ] if left_out else []
 

@@ -238,9 +238,11 @@ def recognised_axes(folder: Path, photographs: Sequence[PosedPhotograph]) -> tup
     Raises:
         InputError: Both fit, or neither.
     """
-    there = sorted(photographs, key=lambda one: natural_order(one.file.as_posix()))
-    chosen = np.unique(np.linspace(0, len(there) - 2, min(PAIRS, len(there) - 1)).astype(int))
-    counts = np.sum([agreeing(there[i], there[i + 1], list(AXES.values())) for i in chosen], axis=0)
+    ordered = sorted(photographs, key=lambda photograph: natural_order(photograph.file.as_posix()))
+    chosen = np.unique(np.linspace(0, len(ordered) - 2, min(PAIRS, len(ordered) - 1)).astype(int))
+    counts = np.sum(
+        [agreeing(ordered[i], ordered[i + 1], list(AXES.values())) for i in chosen], axis=0
+    )
     inliers = dict(zip(AXES, (int(count) for count in counts), strict=True))
     best, other = sorted(inliers, key=lambda axes: -inliers[axes])
     if inliers[best] < FEWEST or inliers[best] < CLEARLY * inliers[other]:
