@@ -119,9 +119,9 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         ]
         lanes = {}
         for key, raw in raw_lanes.items():
-            where = f"{path}, lane {key}"
-            left = _line(files, where, raw, "left_lane_boundary", origin)
-            right = _line(files, where, raw, "right_lane_boundary", origin)
+            location = f"{path}, lane {key}"
+            left = _line(files, location, raw, "left_lane_boundary", origin)
+            right = _line(files, location, raw, "right_lane_boundary", origin)
             lanes[str(key)] = Lane(
                 lane_id=str(key),
                 centre=centre_line(left, right),
@@ -141,9 +141,11 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         )
         crossings = []
         for key, raw in raw_crossings.items():
-            where = f"{path}, crossing {key}"
-            one, two = (_line(files, where, raw, edge, origin) for edge in ("edge1", "edge2"))
-            crossings.append(_closed(np.concatenate([one, two[::-1]])))
+            location = f"{path}, crossing {key}"
+            first_edge, second_edge = (
+                _line(files, location, raw, edge, origin) for edge in ("edge1", "edge2")
+            )
+            crossings.append(_closed(np.concatenate([first_edge, second_edge[::-1]])))
         surface = merge_areas([shapely.Polygon(area[:, :2]) for area in areas])
     lane_map = LaneMap(
         {
@@ -178,9 +180,9 @@ def read_ground(
     The raster is averaged over blocks of 1.5 m; its holes are bridged by the fit. Edges and path
     carry centimetres where it matters.
     """
-    what = "the ground height raster and its Sim2 transform"
-    transform_path = files.only(folder, ("*___img_Sim2_city.json",), what)
-    raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), what)
+    description = "the ground height raster and its Sim2 transform"
+    transform_path = files.only(folder, ("*___img_Sim2_city.json",), description)
+    raster_path = files.only(folder, ("*_ground_height_surface____*.npy",), description)
     sim2 = files.read_json(transform_path)
     raster = parse_npy(files.read_bytes(raster_path), raster_path)
     with parsing(transform_path, "give the keys R, t and s, and a raster of 2-D floats"):
@@ -220,13 +222,13 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
     return mean(padded), mean(row), mean(column)
 
 
-def _line(files: SourceFiles, where: str, raw: JsonObject, key: str, origin: F64) -> F64:
+def _line(files: SourceFiles, location: str, raw: JsonObject, key: str, origin: F64) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
-    with parsing(f"{where}, {key}", "give a list of at least two points with x, y and z"):
+    with parsing(f"{location}, {key}", "give a list of at least two points with x, y and z"):
         points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], np.float64)
         if len(points) < 2:
             raise ValueError(f"{len(points)} points")
-        return near(where, points - origin)
+        return near(location, points - origin)
 
 
 def _closed(ring: F64) -> F64:
@@ -273,12 +275,12 @@ def read_argoverse(path: str | Path) -> RecordedLog:
             folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
         )
         actors, actor_notes = read_actors(files, box_path, poses, origin)
-    own = (
+    log_notes = (
         [f"{dropped} ego poses share their microsecond with the pose before and were dropped"]
         if dropped
         else []
     )
-    own += [
+    log_notes += [
         f"ego poses lowered by {WHEEL_RADIUS_M} m along the body's z axis: from the rear axle to the ground under it",
         "no camera taken from the calibration: the fleet's front camera is a portrait of 47 degrees width; see read_calibration",
         "no speed limits, stop lines or traffic signals: the map has none",
@@ -294,7 +296,7 @@ def read_argoverse(path: str | Path) -> RecordedLog:
         cameras=(),
         world_origin=(float(origin[0]), float(origin[1]), float(origin[2])),
         content_hash=files.content_hash,
-        notes=(*own, *notes, *actor_notes),
+        notes=(*log_notes, *notes, *actor_notes),
     )
 
 
@@ -344,8 +346,8 @@ def read_actors(
     quat = _columns(table, POSE[:4])
     unlike = np.abs(np.linalg.norm(quat, axis=1) - 1) > 1e-2
     if unlike[others].any():
-        found = f"a quaternion that is not of length 1 in row {int(np.argmax(unlike))}"
-        raise InputError(f"{path}: {found}", "give unit quaternions")
+        fault = f"a quaternion that is not of length 1 in row {int(np.argmax(unlike))}"
+        raise InputError(f"{path}: {fault}", "give unit quaternions")
     T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
     T_local_box = T_local_ego @ se3(_columns(table, POSE[4:]), quat)
     xyz = T_local_box[:, :3, 3].copy()
@@ -356,13 +358,15 @@ def read_actors(
     split = 0
     order, first = np.unique(uuid[others], return_index=True)
     for name in order[np.argsort(first)]:
-        mine = others[uuid[others] == name]
-        where = f"{path}, track {name}"
-        track = checked_trajectory(where, t_ns[mine] // 1000, xyz[mine], turns[mine])
-        kind = str(category[mine[0]])
+        track_rows = others[uuid[others] == name]
+        location = f"{path}, track {name}"
+        track = checked_trajectory(
+            location, t_ns[track_rows] // 1000, xyz[track_rows], turns[track_rows]
+        )
+        kind = str(category[track_rows[0]])
         if kind not in LABELS:
             unknown[kind] += 1
-        box = Box(*np.median(size[mine], axis=0).tolist())
+        box = Box(*np.median(size[track_rows], axis=0).tolist())
         label = LABELS.get(kind, "other")
         fixed = kind in FIXED
         parts = actors_of_track(str(name), label, box, track, fixed=fixed)

@@ -33,12 +33,12 @@ GAUSSIANS = b.Bound(
 )
 
 
-def check_record(record: RecordedLog, where: str) -> None:
+def check_record(record: RecordedLog, location: str) -> None:
     """Check what a reader returned, ours or a third party's.
 
     Args:
         record: Map, drive and traffic.
-        where: The log, for messages.
+        location: The log, for messages.
 
     Raises:
         InputError: A number that is not finite or out of range.
@@ -51,35 +51,35 @@ def check_record(record: RecordedLog, where: str) -> None:
         *lane_map.road_edges,
         *lane_map.drivable_areas,
     ]
-    _check_reach(np.concatenate(lines), f"{where}, map and drive")
+    _check_reach(np.concatenate(lines), f"{location}, map and drive")
     for actor in record.actors:
-        here = f"{where}, road user {actor.actor_id}"
+        part_location = f"{location}, road user {actor.actor_id}"
         for side_m in astuple(actor.box):
-            b.BODY_M.check(side_m, here)
-        _check_reach(actor.track.xyz, here)
+            b.BODY_M.check(side_m, part_location)
+        _check_reach(actor.track.xyz, part_location)
     for side_m in astuple(record.vehicle.box):
-        b.VEHICLE_M.check(side_m, f"{where}, ego")
+        b.VEHICLE_M.check(side_m, f"{location}, ego")
     for camera in record.cameras:
-        here = f"{where}, camera {camera.name}"
+        part_location = f"{location}, camera {camera.name}"
         for side_px in (camera.width, camera.height):
-            b.IMAGE_SIDE_PX.check(side_px, here)
+            b.IMAGE_SIDE_PX.check(side_px, part_location)
         if not (np.isfinite(camera.K).all() and np.isfinite(camera.T_rig_camera).all()):
-            raise InputError(f"{here}: a lens or mount that is not finite", "repair it")
+            raise InputError(f"{part_location}: a lens or mount that is not finite", "repair it")
 
 
-def check_scenario(scenario: Scenario, where: str) -> None:
+def check_scenario(scenario: Scenario, location: str) -> None:
     """Check a finished scenario of any source: its road users, its length and what building it
     would cost.
 
     Raises:
         InputError: More than a scenario may have; the number is named.
     """
-    ACTORS.check(len(scenario.actors), where)
-    REACTIVE.check(sum(actor.behaviour.kind != "replay" for actor in scenario.actors), where)
-    b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, where, "length")
+    ACTORS.check(len(scenario.actors), location)
+    REACTIVE.check(sum(actor.behaviour.kind != "replay" for actor in scenario.actors), location)
+    b.LOG_S.check((scenario.end_us - scenario.start_us) * 1e-6, location, "length")
     if scenario.background is not None:
         return
-    GAUSSIANS.check(gaussians_of(scenario), where)
+    GAUSSIANS.check(gaussians_of(scenario), location)
 
 
 def gaussians_of(scenario: Scenario) -> float:
@@ -118,6 +118,6 @@ def memory_mb(scenario: Scenario, drawn_pixels: float) -> float:
     return 220.0 + 2e-4 * gaussians_of(scenario) + 3e-5 * drawn_pixels
 
 
-def _check_reach(xyz: F64, where: str) -> None:
+def _check_reach(xyz: F64, location: str) -> None:
     """Refuse points farther from the origin than a scene reaches, or not finite."""
-    b.COORDINATE_M.check(float(np.abs(xyz).max(initial=0.0)), where, "farthest coordinate")
+    b.COORDINATE_M.check(float(np.abs(xyz).max(initial=0.0)), location, "farthest coordinate")

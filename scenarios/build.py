@@ -38,7 +38,7 @@ from scenarios.schema_parts import (
     StraightSegment,
 )
 from scenarios.traffic import place_actors
-from scenarios.variation import Drawn
+from scenarios.variation import SceneDraft
 
 MIN_GAP_M = 0.3
 STEP_US = 50_000
@@ -47,39 +47,37 @@ SEAM_M = 1e-3  # lanes that share an edge are joined over rounding
 TAIL_US = 4_000_000
 UNPOSTED = 1.5
 LEAST_MORE_M = 1.0
-JOINT_M, STRIP_M = (
-    2.0,
-    6.0,
-)  # where a straight behind the road begins to be free, and to either side
+JOINT_M = 2.0  # behind the road's end, where a straight begins to be free
+STRIP_M = 6.0  # to either side, in which a straight is free
 STEP_M = 4.0  # what a fast car moves from one control step to the next
 TRACKED_EVERY = 20  # poses of the log
 
 
-def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
+def built_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     """Build the road, place the actors and let the expert drive.
 
     Args:
-        drawn: Specification with ``road``.
+        draft: Specification with ``road``.
         vehicle: Ego vehicle.
 
     Raises:
         InputError: A road, an actor or a drive that cannot be built, with the position of its key.
     """
-    spec = drawn.spec
+    spec = draft.spec
     assert spec.road is not None
     written_m = sum(getattr(segment, "length_m", 0.0) for segment in spec.road.segments)
-    ROAD_M.check(written_m, drawn.document.mark(("road", "segments")))
+    ROAD_M.check(written_m, draft.document.mark(("road", "segments")))
     n_actors = sum(getattr(actor, "count", 1) for actor in spec.actors)
-    ACTORS.check(n_actors, drawn.document.mark(("actors",)))
+    ACTORS.check(n_actors, draft.document.mark(("actors",)))
     end_us = spec.built_until_us
-    road, ego_path, length_m = _long_enough(drawn, spec.road, vehicle)
-    scripted, followers = place_actors(drawn, road, ego_path, vehicle, end_us + TAIL_US)
+    road, ego_path, length_m = _long_enough(draft, spec.road, vehicle)
+    scripted, followers = place_actors(draft, road, ego_path, vehicle, end_us + TAIL_US)
     ego_log, driven = drive(
         ego_path.path, spec.ego.start_m, vehicle, spec.ego, scripted, followers, end_us
     )
-    _check_length(drawn, ego_path, ego_log, vehicle, length_m)
+    _check_length(draft, ego_path, ego_log, vehicle, length_m)
     actors = (*scripted, *driven)
-    _check_drive(drawn, road.lane_map, ego_log, vehicle, actors)
+    _check_drive(draft, road.lane_map, ego_log, vehicle, actors)
     route = Route(ego_path.path.xyz[::4], ego_path.lane_ids)
     origin = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
@@ -89,7 +87,7 @@ def built_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
             f"last segment, as far as {fastest_mps(spec):.1f} m/s come in the time",
         )
     return RecordedLog(
-        drawn.scene_id,
+        draft.scene_id,
         "yaml",
         road.lane_map,
         flat(0.0),
@@ -117,37 +115,39 @@ def fastest_mps(spec: ScenarioSpec) -> float:
     return max(spec.road.speed_limit_mps or UNPOSTED * told_mps, told_mps)
 
 
-def _long_enough(drawn: Drawn, spec: RoadSpec, vehicle: Vehicle) -> tuple[Road, EgoPath, float]:
+def _long_enough(
+    draft: SceneDraft, spec: RoadSpec, vehicle: Vehicle
+) -> tuple[Road, EgoPath, float]:
     """Build the road, with a straight behind its last segment where the fastest admissible drive
     comes farther than that, and nothing else is in the way.
 
     Returns:
         The road, the ego's line on it, and the length of that line as written, metres.
     """
-    ego = drawn.spec.ego
+    ego = draft.spec.ego
     parts = elements(spec)
     start = (0.0, 0.0, float(np.deg2rad(spec.heading_deg)))
-    with drawn.at("road", "segments"):
+    with draft.at("road", "segments"):
         road = build_road(parts, profile(spec), start)
-    with drawn.at("ego"):
+    with draft.at("ego"):
         ego_path = make_ego_path(road, ego, spec.segments)
     written_m = ego_path.path.length_m
     if ego.start_m >= written_m:
-        with drawn.at("ego", "start_m"):
+        with draft.at("ego", "start_m"):
             raise _too_short(written_m, ego.start_m)
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
     reach_m = (
         ego.start_m
-        + fastest_mps(drawn.spec) * drawn.spec.built_until_us * 1e-6
+        + fastest_mps(draft.spec) * draft.spec.built_until_us * 1e-6
         + 2 * front_m
         + STEP_M
     )
     more_m = _free_ahead_m(road, ego_path, reach_m - written_m)
     if more_m < LEAST_MORE_M:
         return road, ego_path, written_m
-    with drawn.at("road", "segments"):
+    with draft.at("road", "segments"):
         road = build_road([*parts, Curve(more_m)], profile(spec), start)
-    with drawn.at("ego"):
+    with draft.at("ego"):
         ego_path = make_ego_path(road, ego, spec.segments)
     return road, ego_path, written_m
 
@@ -171,7 +171,7 @@ def _free_ahead_m(road: Road, ego_path: EgoPath, more_m: float) -> float:
 
 
 def _check_length(
-    drawn: Drawn, ego_path: EgoPath, ego_log: Trajectory, vehicle: Vehicle, written_m: float
+    draft: SceneDraft, ego_path: EgoPath, ego_log: Trajectory, vehicle: Vehicle, written_m: float
 ) -> None:
     """Check that the recorded drive stays on the road as it is written.
 
@@ -180,13 +180,13 @@ def _check_length(
     """
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
     tracker = PathTracker(ego_path.path.xyz[::4])
-    end_us = drawn.spec.built_until_us
+    end_us = draft.spec.built_until_us
     last_us = int(ego_log.t_us[-1])
     for k in [*range(0, len(ego_log.t_us), TRACKED_EVERY), len(ego_log.t_us) - 1]:
         s_m = tracker.follow(ego_log.xyz[k, :2])
         t_us = int(ego_log.t_us[k])
         if s_m + front_m + 1.0 > written_m or (t_us == last_us < end_us):
-            with drawn.at("road", "segments"):
+            with draft.at("road", "segments"):
                 raise _too_short(
                     written_m, s_m, f" after {t_us / 1e6:.1f} s of {end_us / 1e6:.1f} s"
                 )
@@ -201,15 +201,15 @@ def before_end(beyond: F64, vehicle: Vehicle) -> F64:
     return beyond[along_m <= along_m[-1] - front_m - STEP_M]
 
 
-def with_last(points: F64, every: int) -> F64:
-    """Return every n-th of some points ``(N, D)``, and the last one."""
-    return points[[*range(0, len(points) - 1, every), len(points) - 1]]
+def with_last(points: F64, stride: int) -> F64:
+    """Return one of ``stride`` points ``(N, D)``, from the first on, and the last point."""
+    return points[[*range(0, len(points) - 1, stride), len(points) - 1]]
 
 
 def _too_short(length_m: float, s_m: float, when: str = "") -> InputError:
-    found = f"the road is {length_m:.0f} m long and the ego stands at {s_m:.0f} m{when}"
+    fault = f"the road is {length_m:.0f} m long and the ego stands at {s_m:.0f} m{when}"
     do_this = "add or lengthen a segment, shorten timing.duration_us, or lower ego.cruise_mps"
-    return InputError(f"road: {found}", do_this)
+    return InputError(f"road: {fault}", do_this)
 
 
 def elements(spec: RoadSpec) -> list[Element]:
@@ -251,7 +251,11 @@ def profile(spec: RoadSpec) -> Profile:
 
 
 def _check_drive(
-    drawn: Drawn, lane_map: LaneMap, ego_log: Trajectory, vehicle: Vehicle, actors: Sequence[Actor]
+    draft: SceneDraft,
+    lane_map: LaneMap,
+    ego_log: Trajectory,
+    vehicle: Vehicle,
+    actors: Sequence[Actor],
 ) -> None:
     """Check that the ego's footprint stays on the vehicle lanes and `MIN_GAP_M` clear of all
     actors.
@@ -259,7 +263,7 @@ def _check_drive(
     Raises:
         InputError: It does not, with the position of the road or of the actor.
     """
-    last_us = min(drawn.spec.built_until_us, int(ego_log.t_us[-1]))
+    last_us = min(draft.spec.built_until_us, int(ego_log.t_us[-1]))
     t_us = np.arange(int(ego_log.t_us[0]), last_us + 1, STEP_US)
     ego = _footprints(ego_log, t_us, vehicle.box, vehicle.rear_axle_to_centre_m)
     lanes = [lane for lane in lane_map.lanes.values() if lane.kind == "vehicle"]
@@ -268,10 +272,10 @@ def _check_drive(
     off = np.flatnonzero(~shapely.covers(road, ego))
     if len(off):
         outside_m2 = shapely.area(shapely.difference(ego[off[0]], road))
-        found = f"at {t_us[off[0]] / 1e6:.2f} s {outside_m2:.2f} m2 of the ego leave the lanes"
-        with drawn.at("road", "segments"):
+        fault = f"at {t_us[off[0]] / 1e6:.2f} s {outside_m2:.2f} m2 of the ego leave the lanes"
+        with draft.at("road", "segments"):
             raise InputError(
-                f"the road: {found}",
+                f"the road: {fault}",
                 "use wider lanes, gentler bends, a larger corner_radius_m, or a smaller shift_m",
             )
     gap, when, who = min(
@@ -279,12 +283,12 @@ def _check_drive(
         default=(np.inf, 0, ""),
     )
     if gap < MIN_GAP_M:
-        found = (
+        fault = (
             f"at {when / 1e6:.2f} s the gap to the ego is {gap:.2f} m (least allowed {MIN_GAP_M} m)"
         )
-        with drawn.at(*_key_of(drawn.spec, who)):
+        with draft.at(*_key_of(draft.spec, who)):
             raise InputError(
-                f"actor {who}: {found}",
+                f"actor {who}: {fault}",
                 "start the actor farther away, change its timing, or slow the ego down",
             )
 
@@ -311,10 +315,10 @@ def _least_gap(ego: F64, t_us: I64, actor: Actor) -> tuple[float, int]:
     """Return the least distance of an actor to the ego's footprints ``(T,)`` and when it is;
     infinite where they never meet in time.
     """
-    there = np.flatnonzero((t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1]))
-    if len(there) == 0:
+    rows = np.flatnonzero((t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1]))
+    if len(rows) == 0:
         return float("inf"), 0
-    body = _footprints(actor.track, t_us[there], actor.box)
-    distance = shapely.distance(ego[there], body)
+    body = _footprints(actor.track, t_us[rows], actor.box)
+    distance = shapely.distance(ego[rows], body)
     k = int(np.argmin(distance))
-    return float(distance[k]), int(t_us[there[k]])
+    return float(distance[k]), int(t_us[rows[k]])

@@ -18,7 +18,7 @@ from alpasim_plugin.core.files.reading import contents
 from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
 from scenarios.schema import CameraModel, CameraSet, Rigs
-from scenarios.variation import Drawn
+from scenarios.variation import SceneDraft
 
 RIGS_FILE = Path(__file__).with_name("rigs.yaml")
 RIG_PIXELS = b.Bound(
@@ -28,26 +28,26 @@ DEEPEST_M = 0.5  # below the body's surface: a camera behind the windscreen stan
 FARTHEST_M = 0.6  # outside of the body
 
 
-def given_cameras(drawn: Drawn) -> tuple[CameraSpec, ...] | None:
+def given_cameras(draft: SceneDraft) -> tuple[CameraSpec, ...] | None:
     """Return the cameras of a scenario file; None where it leaves them to the log.
 
     Raises:
         InputError: No such file, a lens that is none, a period that is no multiple of the control
             period, a shutter longer than that, or too many pixels; with the position of its key.
     """
-    given = drawn.spec.cameras
-    if given is None:
+    camera_specs = draft.spec.cameras
+    if camera_specs is None:
         return None
-    if isinstance(given, CameraSet):
-        cameras = _from_set(drawn, given)
+    if isinstance(camera_specs, CameraSet):
+        cameras = _from_set(draft, camera_specs)
     else:
-        cameras = tuple(camera_spec(model) for model in given)
-    control_us = drawn.spec.rates.control_us
+        cameras = tuple(camera_spec(model) for model in camera_specs)
+    control_us = draft.spec.rates.control_us
     names = [camera.name for camera in cameras]
-    with drawn.at("cameras"):
+    with draft.at("cameras"):
         RIG_PIXELS.check(sum(camera.width * camera.height for camera in cameras), "cameras")
     for i, camera in enumerate(cameras):
-        with drawn.at("cameras", i):
+        with draft.at("cameras", i):
             if camera.name in names[:i]:
                 raise InputError(f"two cameras named {camera.name!r}", "give one another name")
             if camera.interval_us % control_us or camera.shutter_us > control_us:
@@ -59,7 +59,7 @@ def given_cameras(drawn: Drawn) -> tuple[CameraSpec, ...] | None:
     return cameras
 
 
-def check_mounts(drawn: Drawn, cameras: Sequence[CameraSpec], vehicle: Vehicle) -> None:
+def check_mounts(draft: SceneDraft, cameras: Sequence[CameraSpec], vehicle: Vehicle) -> None:
     """Refuse cameras that stand inside the car's body, or away from it.
 
     Raises:
@@ -72,16 +72,16 @@ def check_mounts(drawn: Drawn, cameras: Sequence[CameraSpec], vehicle: Vehicle) 
         outside = np.abs(camera.T_rig_camera[:3, 3] - centre) - half  # along each axis, metres
         deep_m = -float(outside.max())
         far_m = float(np.linalg.norm(np.maximum(outside, 0.0)))
-        at = np.round(camera.T_rig_camera[:3, 3], 2).tolist()
-        with drawn.at("cameras", i):
+        position = np.round(camera.T_rig_camera[:3, 3], 2).tolist()
+        with draft.at("cameras", i):
             if deep_m > DEEPEST_M:
                 raise InputError(
-                    f"camera {camera.name!r} at {at}: {deep_m:.2f} m inside the car's body",
+                    f"camera {camera.name!r} at {position}: {deep_m:.2f} m inside the car's body",
                     "mount it at the body's surface, or give the vehicle its true size",
                 )
             if far_m > FARTHEST_M:
                 raise InputError(
-                    f"camera {camera.name!r} at {at}: {far_m:.2f} m away from the car's body",
+                    f"camera {camera.name!r} at {position}: {far_m:.2f} m away from the car's body",
                     "use the calibration of this car, or give the vehicle its true size",
                 )
 
@@ -112,21 +112,23 @@ def _focal_px(m: CameraModel) -> float:
     return 0.5 * m.width / (float(half) * bent)
 
 
-def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
-    if given.rig is not None:
+def _from_set(draft: SceneDraft, camera_set: CameraSet) -> tuple[CameraSpec, ...]:
+    if camera_set.rig is not None:
         document = load_yaml(RIGS_FILE)
-        rig = validate(Rigs, Document({"rigs": document.data}, {}, str(RIGS_FILE))).rigs[given.rig]
+        rig = validate(Rigs, Document({"rigs": document.data}, {}, str(RIGS_FILE))).rigs[
+            camera_set.rig
+        ]
         cameras = tuple(camera_spec(model) for model in rig)
     else:
-        assert given.from_ is not None, "a set has a rig or a file"
-        path = drawn.document.folder_of(("cameras", "from")) / given.from_
+        assert camera_set.from_ is not None, "a set has a rig or a file"
+        path = draft.document.folder_of(("cameras", "from")) / camera_set.from_
         if not os.path.exists(path):
-            raise drawn.document.error(
+            raise draft.document.error(
                 ("cameras", "from"),
                 f"{path} does not exist",
                 "correct the path; it is relative to the scenario file",
             )
-        with drawn.at("cameras", "from"):
+        with draft.at("cameras", "from"):
             if os.path.isdir(path / "calibration"):
                 from scenarios.argoverse import read_calibration
 
@@ -144,17 +146,17 @@ def _from_set(drawn: Drawn, given: CameraSet) -> tuple[CameraSpec, ...]:
                     f"{path}: {contents(path)}, no calibration that is known here",
                     "give an Argoverse 2 log, which has a folder calibration, a .usdz of AlpaSim, or a transforms.json",
                 )
-        if given.names:
-            known = {camera.name: camera for camera in cameras}
-            for i, name in enumerate(given.names):
-                if name not in known:
-                    raise drawn.document.error(
+        if camera_set.names:
+            cameras_by_name = {camera.name: camera for camera in cameras}
+            for i, name in enumerate(camera_set.names):
+                if name not in cameras_by_name:
+                    raise draft.document.error(
                         ("cameras", "names", i),
                         f"no camera {name!r} in this calibration",
-                        f"choose from {', '.join(known)}",
+                        f"choose from {', '.join(cameras_by_name)}",
                     )
-            cameras = tuple(known[name] for name in given.names)
-    if given.width is not None:
-        width = given.width
+            cameras = tuple(cameras_by_name[name] for name in camera_set.names)
+    if camera_set.width is not None:
+        width = camera_set.width
         cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)
-    return tuple(replace(camera, shutter_us=given.shutter_us) for camera in cameras)
+    return tuple(replace(camera, shutter_us=camera_set.shutter_us) for camera in cameras)

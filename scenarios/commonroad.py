@@ -30,6 +30,7 @@ from scenarios.commonroad_map import number, point, read_lanelets
 from scenarios.map_lines import ground_of
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
+# All else (train, pillar, constructionZone, building, ...) is "other".
 LABELS = {
     "car": "car",
     "taxi": "car",
@@ -40,7 +41,7 @@ LABELS = {
     "bicycle": "cyclist",
     "motorcycle": "motorcycle",
     "pedestrian": "pedestrian",
-}  # all else (train, pillar, constructionZone, building, ...) is "other"
+}
 HEIGHTS_M = {
     "car": 1.5,
     "truck": 3.2,
@@ -71,8 +72,8 @@ class Obstacle:
         """Return the poses of the box centre, time in integer microseconds."""
         t_us = np.round(self.steps * (dt_s * 1e6)).astype(np.int64)
         xyz = self.centre + np.array([0.0, 0.0, self.box.height_m / 2])
-        where = f"{path}, obstacle {self.obstacle_id}"
-        return checked_trajectory(where, t_us, xyz, quat_from_yaw(self.yaw))
+        location = f"{path}, obstacle {self.obstacle_id}"
+        return checked_trajectory(location, t_us, xyz, quat_from_yaw(self.yaw))
 
 
 def read_obstacles(path: Path, root: Element) -> tuple[list[Obstacle], list[str]]:
@@ -188,9 +189,9 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     root = files.read_xml(file)
     version = root.get("commonRoadVersion")
     if root.tag != "commonRoad" or version not in VERSIONS:
-        found = f"root element {root.tag!r}, version {version!r}"
+        fault = f"root element {root.tag!r}, version {version!r}"
         do_this = f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
-        raise InputError(f"{file}: {found}", do_this)
+        raise InputError(f"{file}: {fault}", do_this)
     with parsing(file, "give the time step in seconds"):
         dt_s = float(root.get("timeStepSize", ""))
     TIME_STEP_S.check(dt_s, file, "timeStepSize")
@@ -202,9 +203,9 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         )
     # Whole metres: the subtraction loses nothing.
     origin = np.array([*np.round(obstacles[0].centre[0, :2]), 0.0])
-    obstacles = [replace(one, centre=one.centre - origin) for one in obstacles]
-    for one in obstacles:
-        near(f"{file}, obstacle {one.obstacle_id}", one.centre)
+    obstacles = [replace(obstacle, centre=obstacle.centre - origin) for obstacle in obstacles]
+    for obstacle in obstacles:
+        near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(file, root, origin)
     chosen, why = _choose_ego(file, obstacles, ego)
     # The file has sizes and no axles: the default chassis in proportion.
@@ -218,17 +219,19 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
             f"{file}, obstacle {chosen.obstacle_id}: 1 state", "choose an ego with a trajectory"
         )
     T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
-    steps = np.concatenate([one.steps for one in obstacles if not one.static])
+    steps = np.concatenate([obstacle.steps for obstacle in obstacles if not obstacle.static])
     ends_us = np.round(np.array([steps.min(), steps.max()]) * dt_s * 1e6).astype(np.int64)
     actors = []
-    for one in obstacles:
-        track = one.trajectory(file, dt_s)
-        if one.static:  # it is there for the whole recording
+    for obstacle in obstacles:
+        track = obstacle.trajectory(file, dt_s)
+        if obstacle.static:  # it is there for the whole recording
             xyz, quat = (np.repeat(column, 2, axis=0) for column in (track.xyz, track.quat))
             still = Trajectory(ends_us, xyz, quat)
-            actors.append(Actor(one.obstacle_id, one.label, one.box, still, is_static=True))
-        elif one is not chosen:
-            actors += actors_of_track(one.obstacle_id, one.label, one.box, track)
+            actors.append(
+                Actor(obstacle.obstacle_id, obstacle.label, obstacle.box, still, is_static=True)
+            )
+        elif obstacle is not chosen:
+            actors += actors_of_track(obstacle.obstacle_id, obstacle.label, obstacle.box, track)
     notes = (
         why,
         f"ego box {chosen.box.length_m} x {chosen.box.width_m} m from the file; rear axle assumed {vehicle.rear_axle_to_centre_m:.2f} m "
@@ -255,7 +258,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
 
 
 def _choose_ego(path: Path, obstacles: list[Obstacle], ego: str | None) -> tuple[Obstacle, str]:
-    moving = {one.obstacle_id: one for one in obstacles if not one.static}
+    moving = {obstacle.obstacle_id: obstacle for obstacle in obstacles if not obstacle.static}
     if ego is not None:
         if ego not in moving:
             raise InputError(
@@ -263,19 +266,26 @@ def _choose_ego(path: Path, obstacles: list[Obstacle], ego: str | None) -> tuple
                 f"choose the ego among {', '.join(sorted(moving)) or 'none'}",
             )
         return moving[ego], f"ego is the recorded vehicle {ego}, as asked"
-    first = min((int(one.steps[0]) for one in moving.values()), default=0)
-    last = max((int(one.steps[-1]) for one in moving.values()), default=0)
+    first = min((int(obstacle.steps[0]) for obstacle in moving.values()), default=0)
+    last = max((int(obstacle.steps[-1]) for obstacle in moving.values()), default=0)
     always = [
-        one
-        for one in moving.values()
-        if one.label == "car" and np.array_equal(one.steps, np.arange(first, last + 1))
+        obstacle
+        for obstacle in moving.values()
+        if obstacle.label == "car" and np.array_equal(obstacle.steps, np.arange(first, last + 1))
     ]
     if not always:
         raise InputError(
             f"{path}: {len(moving)} moving obstacles, none a car that is present all the time",
             "name the recorded vehicle that shall be the ego",
         )
-    chosen = min(always, key=lambda one: (-_driven_m(one), len(one.obstacle_id), one.obstacle_id))
+    chosen = min(
+        always,
+        key=lambda obstacle: (
+            -_driven_m(obstacle),
+            len(obstacle.obstacle_id),
+            obstacle.obstacle_id,
+        ),
+    )
     drive = f"the longest drive ({_driven_m(chosen):.1f} m)"
     return (
         chosen,

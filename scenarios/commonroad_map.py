@@ -3,7 +3,7 @@
 import contextlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -41,16 +41,48 @@ COLOURS = {
     "green": "green",
     "inactive": "inactive",
 }
-Cycle = tuple[tuple[tuple[str, int], ...], int]  # phases in microseconds, and when the first begins
+# Phases in microseconds, and when the first begins.
+Cycle = tuple[tuple[tuple[str, int], ...], int]
 KINDS = {"shoulder": "shoulder", "busLane": "bus", "bicycleLane": "bike", "parking": "parking"}
-NOT_FOR_CARS = ("sidewalk", "crosswalk")
+NOT_FOR_CARS = {"sidewalk", "crosswalk"}
 _FOR_CARS = """urban interstate country highway exitRamp accessRamp mainCarriageWay driveWay
     intersection busStop"""
-KNOWN = {*KINDS, *NOT_FOR_CARS, *_FOR_CARS.split()}
-MAX_SPEED_SIGNS = ("274", "R2-1")  # German and US maximum speed; the additional value is in m/s
-CROSSING_SHARE = (
-    0.1  # a lanelet covered to this share by lanelets it is not linked to lies in an intersection
-)
+TYPES = {*KINDS, *NOT_FOR_CARS, *_FOR_CARS.split()}
+# German and US maximum speed; the additional value is in m/s.
+MAX_SPEED_SIGNS = ("274", "R2-1")
+# A lanelet covered to this share by lanelets it is not linked to lies in an intersection.
+CROSSING_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Lanelet:
+    """A lanelet as its file has it.
+
+    Attributes:
+        element: The lanelet's element.
+        lane_id: The lanelet's id.
+        location: File and id, for messages.
+        types: The lanelet's types, none of them checked.
+        left: The left bound ``(N, 3)``, metres, local.
+        right: The right bound ``(M, 3)``, metres, local.
+    """
+
+    element: Element
+    lane_id: str
+    location: str
+    types: tuple[str, ...]
+    left: F64
+    right: F64
+
+    @property
+    def is_for_cars(self) -> bool:
+        """Return whether vehicles may drive on it."""
+        return not any(name in NOT_FOR_CARS for name in self.types)
+
+    @property
+    def has_exchanged_bounds(self) -> bool:
+        """Return whether the file names the left bound right and the right bound left."""
+        return is_left_of(self.right, self.left)
 
 
 def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
@@ -59,99 +91,161 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
     Raises:
         InputError: There is no lanelet for vehicles, or one lacks a bound.
     """
-    elements = root.findall("lanelet")
     signs = _speed_signs(root)
-    lights, notes = _traffic_lights(path, root)
-    signals = []
-    lanes: dict[str, Lane] = {}
-    crosswalks = []
-    stop_lines = []
-    left_out: Counter[str] = Counter()
-    strange: Counter[str] = Counter()
-    swapped = 0
-    for element in elements:
-        lane_id = str(element.get("id"))
-        where = f"{path}, lanelet {lane_id}"
-        with parsing(where, "correct the lanelet"):
-            left, right = (
-                near(where, _line(element, side, 2) - origin)
-                for side in ("leftBound", "rightBound")
-            )
-            types = [str(t.text) for t in element.findall("laneletType")]
-            if any(t in NOT_FOR_CARS for t in types):
-                left_out.update(t for t in types if t in NOT_FOR_CARS)
-                if "crosswalk" in types:
-                    crosswalks.append(np.concatenate([left, right[::-1], left[:1]]))
-                continue
-            strange.update(t for t in types if t not in KNOWN)
-            if is_left_of(right, left):  # bounds exchanged
-                left, right, swapped = right, left, swapped + 1
-            waits = np.stack([left[-1], right[-1]])
-            if element.find("stopLine") is not None:
-                points = _line(element, "stopLine", 0)
-                waits = points - origin if len(points) == 2 else waits
-                stop_lines.append(waits)
-            centre = centre_line(left, right)
-            ahead = centre[-1] - centre[-2]
-            heading = float(heading_of(ahead))
-            refs = [
-                str(ref.get("ref"))
-                for place in ("trafficLightRef", "stopLine/trafficLightRef")
-                for ref in element.findall(place)
-            ]
-            signals += [
-                Signal(waits, heading, *lights[ref]) for ref in dict.fromkeys(refs) if ref in lights
-            ]
-            neighbours = {
-                beside.tag: str(beside.get("ref"))
-                for beside in element
-                if beside.get("drivingDir") == "same"
-            }
-            lanes[lane_id] = Lane(
-                lane_id=lane_id,
-                centre=centre,
-                left=left,
-                right=right,
-                kind=next((KINDS[t] for t in types if t in KINDS), "vehicle"),
-                successors=tuple(str(s.get("ref")) for s in element.findall("successor")),
-                left_neighbour=neighbours.get("adjacentLeft"),
-                right_neighbour=neighbours.get("adjacentRight"),
-                left_mark_type=MARK_TYPES.get(
-                    str(element.findtext("leftBound/lineMarking")), "unknown"
-                ),
-                right_mark_type=MARK_TYPES.get(
-                    str(element.findtext("rightBound/lineMarking")), "unknown"
-                ),
-                is_intersection="intersection" in types,
-                speed_limit_mps=_speed_limit(element, signs),
-            )
-    if not lanes:
+    lights, light_notes = _traffic_lights(path, root)
+    lanelets = [_lanelet(path, element, origin) for element in root.findall("lanelet")]
+    roads = [_with_bounds_in_order(lanelet) for lanelet in lanelets if lanelet.is_for_cars]
+    if not roads:
         raise InputError(
-            f"{path}: {len(elements)} lanelets, none for vehicles", "use a scenario with a road"
+            f"{path}: {len(lanelets)} lanelets, none for vehicles", "use a scenario with a road"
         )
-    notes += [
-        f"{n} lanelets of type {t} carry no vehicles and are no lanes"
-        for t, n in sorted(left_out.items())
+    lanes: dict[str, Lane] = {}
+    stop_lines: list[F64] = []
+    signals: list[Signal] = []
+    for lanelet in roads:
+        with parsing(lanelet.location, "correct the lanelet"):
+            lane = _lane(lanelet, signs)
+            lanes[lanelet.lane_id] = lane
+            waiting_line = _waiting_line(lanelet, origin)
+            signals += _signals(lanelet, lane.centre, waiting_line, lights)
+            if _has_stop_line(lanelet):
+                stop_lines.append(waiting_line)
+    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
+    lane_map = LaneMap(
+        lanes=mark_intersections(lanes),
+        road_edges=border_lines(surface, np.concatenate(lane_edges(lanes))),
+        crosswalks=tuple(_ring(lanelet) for lanelet in lanelets if "crosswalk" in lanelet.types),
+        stop_lines=tuple(stop_lines),
+        signals=tuple(signals) or None,
+    )
+    return lane_map, (*light_notes, *_lanelet_notes(root, lanelets))
+
+
+def _lanelet(path: Path, element: Element, origin: F64) -> Lanelet:
+    """Read id, types and bounds of a lanelet.
+
+    Raises:
+        InputError: A bound is missing, or a point is not finite or far away.
+    """
+    lane_id = str(element.get("id"))
+    location = f"{path}, lanelet {lane_id}"
+    with parsing(location, "correct the lanelet"):
+        return Lanelet(
+            element=element,
+            lane_id=lane_id,
+            location=location,
+            types=tuple(str(kind.text) for kind in element.findall("laneletType")),
+            left=near(location, _line(element, "leftBound", 2) - origin),
+            right=near(location, _line(element, "rightBound", 2) - origin),
+        )
+
+
+def _with_bounds_in_order(lanelet: Lanelet) -> Lanelet:
+    """Return a lanelet whose left bound is on the left."""
+    if lanelet.has_exchanged_bounds:
+        return replace(lanelet, left=lanelet.right, right=lanelet.left)
+    return lanelet
+
+
+def _ring(lanelet: Lanelet) -> F64:
+    """Return the closed outline ``(N, 3)`` of a lanelet."""
+    return np.concatenate([lanelet.left, lanelet.right[::-1], lanelet.left[:1]])
+
+
+def _lane(lanelet: Lanelet, signs: dict[str, float]) -> Lane:
+    """Return a lanelet as a lane; ``signs`` holds speed limits, m/s, by the id of their sign."""
+    element = lanelet.element
+    neighbours = {
+        neighbour.tag: str(neighbour.get("ref"))
+        for neighbour in element
+        if neighbour.get("drivingDir") == "same"
+    }
+    return Lane(
+        lane_id=lanelet.lane_id,
+        centre=centre_line(lanelet.left, lanelet.right),
+        left=lanelet.left,
+        right=lanelet.right,
+        kind=next((KINDS[name] for name in lanelet.types if name in KINDS), "vehicle"),
+        successors=tuple(str(link.get("ref")) for link in element.findall("successor")),
+        left_neighbour=neighbours.get("adjacentLeft"),
+        right_neighbour=neighbours.get("adjacentRight"),
+        left_mark_type=_mark_type(element, "leftBound"),
+        right_mark_type=_mark_type(element, "rightBound"),
+        is_intersection="intersection" in lanelet.types,
+        speed_limit_mps=_speed_limit(element, signs),
+    )
+
+
+def _mark_type(element: Element, bound: str) -> LaneMarkType:
+    return MARK_TYPES.get(str(element.findtext(f"{bound}/lineMarking")), "unknown")
+
+
+def _has_stop_line(lanelet: Lanelet) -> bool:
+    return lanelet.element.find("stopLine") is not None
+
+
+def _waiting_line(lanelet: Lanelet, origin: F64) -> F64:
+    """Return the line ``(2, 3)``, metres, local, that vehicles on a lanelet wait at.
+
+    It is the stop line; the end of the lanelet where there is no stop line, or one that is not
+    given by two points.
+    """
+    end = np.stack([lanelet.left[-1], lanelet.right[-1]])
+    if not _has_stop_line(lanelet):
+        return end
+    points = _line(lanelet.element, "stopLine", 0)
+    return points - origin if len(points) == 2 else end
+
+
+def _signals(
+    lanelet: Lanelet, centre: F64, waiting_line: F64, lights: dict[str, Cycle]
+) -> list[Signal]:
+    """Return the traffic lights that a lanelet refers to, each once; one without a cycle is left
+    out.
+
+    Args:
+        lanelet: The lanelet that a light holds back.
+        centre: Its centre line ``(N, 3)``, whose end gives the heading of the traffic.
+        waiting_line: ``(2, 3)``, where vehicles wait.
+        lights: Cycles by the id of their light.
+    """
+    heading = float(heading_of(centre[-1] - centre[-2]))
+    references = [
+        *lanelet.element.findall("trafficLightRef"),
+        *lanelet.element.findall("stopLine/trafficLightRef"),
+    ]
+    light_ids = dict.fromkeys(str(reference.get("ref")) for reference in references)
+    return [
+        Signal(waiting_line, heading, *lights[light_id])
+        for light_id in light_ids
+        if light_id in lights
+    ]
+
+
+def _lanelet_notes(root: Element, lanelets: Sequence[Lanelet]) -> list[str]:
+    """Return notes on what was left out, assumed or put right."""
+    roads = [lanelet for lanelet in lanelets if lanelet.is_for_cars]
+    names = Counter(name for lanelet in lanelets for name in lanelet.types)
+    road_names = Counter(name for lanelet in roads for name in lanelet.types)
+    n_exchanged = sum(lanelet.has_exchanged_bounds for lanelet in roads)
+    notes = [
+        f"{names[name]} lanelets of type {name} carry no vehicles and are no lanes"
+        for name in sorted(names.keys() & NOT_FOR_CARS)
     ]
     notes += [
-        f"{n} lanelets of type {t} are taken as lanes for vehicles"
-        for t, n in sorted(strange.items())
+        f"{road_names[name]} lanelets of type {name} are taken as lanes for vehicles"
+        for name in sorted(road_names.keys() - TYPES)
     ]
-    if swapped:
-        notes.append(f"{swapped} lanelets had left and right bound exchanged and were put right")
+    if n_exchanged:
+        notes.append(
+            f"{n_exchanged} lanelets had left and right bound exchanged and were put right"
+        )
     if root.find("lanelet/*/lineMarking") is None:
         notes.append("the file has no line markings: those of all lane edges are unknown")
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    return LaneMap(
-        lanes=mark_intersections(lanes),
-        road_edges=border_lines(surface, np.concatenate(lane_edges(lanes))),
-        crosswalks=tuple(crosswalks),
-        stop_lines=tuple(stop_lines),
-        signals=tuple(signals) or None,
-    ), tuple(notes)
+    return notes
 
 
 def point(element: Element) -> tuple[float, float, float]:
@@ -193,7 +287,7 @@ def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[s
             steps.
     """
     step_us = float(str(root.get("timeStepSize"))) * 1e6  # the reader has checked it
-    found: dict[str, Cycle] = {}
+    cycles: dict[str, Cycle] = {}
     lights = root.findall("trafficLight")
     for light in lights:
         key = str(light.get("id"))
@@ -209,9 +303,9 @@ def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[s
                 if lasts_us <= 0:
                     raise ValueError(f"a duration of {lasts_us} us")
                 phases.append((COLOURS[str(part.findtext("color"))], lasts_us))
-            found[key] = tuple(phases), round(number(light, "cycle/timeOffset", 0.0) * step_us)
-    left_out = len(lights) - len(found)
-    return found, [
+            cycles[key] = tuple(phases), round(number(light, "cycle/timeOffset", 0.0) * step_us)
+    left_out = len(lights) - len(cycles)
+    return cycles, [
         f"{left_out} traffic lights are off, without a cycle or for some directions only, and are not used"
     ] if left_out else []
 

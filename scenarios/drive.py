@@ -87,12 +87,12 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
         },
         "actors": [
             {
-                "id": one.actor_id,
-                "label": one.label,
-                "box": vars(one.box),
-                "track": _track(one.track),
+                "id": actor.actor_id,
+                "label": actor.label,
+                "box": vars(actor.box),
+                "track": _track(actor.track),
             }
-            for one in log.actors
+            for actor in log.actors
         ],
         "cameras": [
             {
@@ -108,13 +108,13 @@ def write_drive(folder: Path, log: RecordedLog, obstacles: Sequence[Obstacle]) -
         "ground": {"x0_m": log.ground.x0_m, "y0_m": log.ground.y0_m, "cell_m": log.ground.cell_m},
         "obstacles": [
             {
-                "id": one.obstacle_id,
-                "size_m": [one.box.length_m, one.box.width_m, one.box.height_m],
-                "xyz": one.xyz.tolist(),
-                "yaw_rad": one.yaw_rad,
-                "uncertainty_m": one.uncertainty_m,
+                "id": obstacle.obstacle_id,
+                "size_m": [obstacle.box.length_m, obstacle.box.width_m, obstacle.box.height_m],
+                "xyz": obstacle.xyz.tolist(),
+                "yaw_rad": obstacle.yaw_rad,
+                "uncertainty_m": obstacle.uncertainty_m,
             }
-            for one in obstacles
+            for obstacle in obstacles
         ],
         "world_origin": list(log.world_origin),
         "notes": list(log.notes),
@@ -126,10 +126,10 @@ def _map_document(lane_map: LaneMap) -> JsonObject:
     lines = {
         name: [line.tolist() for line in getattr(lane_map, name)] for name in (*LINES, *MORE_LINES)
     }
-    signals = {
-        name: None if (some := getattr(lane_map, name)) is None else [_record(one) for one in some]
-        for name in SIGNALS
-    }
+    signals: JsonObject = {}
+    for name in SIGNALS:
+        records = getattr(lane_map, name)
+        signals[name] = None if records is None else [_record(record) for record in records]
     return {
         "lanes": [_record(lane) for lane in lane_map.lanes.values()],
         **lines,
@@ -141,8 +141,8 @@ def _map_document(lane_map: LaneMap) -> JsonObject:
     }
 
 
-def _record(one: Lane | Marking | Signal) -> JsonObject:
-    return {name: _plain(value) for name, value in vars(one).items()}
+def _record(element: Lane | Marking | Signal) -> JsonObject:
+    return {name: _plain(value) for name, value in vars(element).items()}
 
 
 def _track(track: Trajectory) -> JsonObject:
@@ -174,18 +174,20 @@ def read_drive(folder: Path) -> RecordedLog:
         size = body["length_m"], body["width_m"], body["height_m"]
         wheelbase_m = body.get("wheelbase_m", Vehicle.wheelbase_m)
         actors = [
-            Actor(one["id"], one["label"], Box(**one["box"]), _trajectory(path, one["track"]))
-            for one in document.get("actors", [])
+            Actor(
+                entry["id"], entry["label"], Box(**entry["box"]), _trajectory(path, entry["track"])
+            )
+            for entry in document.get("actors", [])
         ]
         cameras = [
             CameraSpec(
-                one["name"],
-                one["width"],
-                one["height"],
-                _rows(one["K"]),
-                _rows(one["T_rig_camera"], 4),
+                entry["name"],
+                entry["width"],
+                entry["height"],
+                _rows(entry["K"]),
+                _rows(entry["T_rig_camera"], 4),
             )
-            for one in document["cameras"]
+            for entry in document["cameras"]
         ]
         x, y, z = document["world_origin"]
         return RecordedLog(
@@ -195,7 +197,7 @@ def read_drive(folder: Path) -> RecordedLog:
             ground=_ground_of(files, folder, document["ground"]),
             ego_log=log,
             vehicle=Vehicle(Box(*size), body["rear_axle_to_centre_m"], wheelbase_m),
-            actors=(*actors, *(_obstacle_actor(one, log) for one in document["obstacles"])),
+            actors=(*actors, *(_obstacle_actor(entry, log) for entry in document["obstacles"])),
             cameras=tuple(cameras),
             world_origin=(x, y, z),
             content_hash=files.content_hash,
@@ -228,10 +230,12 @@ def _map_of(document: JsonObject) -> LaneMap:
     return LaneMap(
         lanes,
         markings=tuple(
-            Marking(_rows(one["xyz"]), one["mark_type"]) for one in document.get("markings", ())
+            Marking(_rows(entry["xyz"]), entry["mark_type"])
+            for entry in document.get("markings", ())
         ),
         signs=tuple(
-            (_rows(one["T_world_sign"], 4), Box(**one["box"])) for one in document.get("signs", ())
+            (_rows(entry["T_world_sign"], 4), Box(**entry["box"]))
+            for entry in document.get("signs", ())
         ),
         signals=None if signals is None else tuple(map(_signal, signals)),
         give_way=tuple(map(_signal, document.get("give_way", ()))),
@@ -262,12 +266,12 @@ def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightFiel
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], z)
 
 
-def _obstacle_actor(one: JsonObject, ego: Trajectory) -> Actor:
+def _obstacle_actor(entry: JsonObject, ego: Trajectory) -> Actor:
     """Return an obstacle as an actor that stands for the whole drive."""
-    xyz = np.tile(_rows(one["xyz"]), (2, 1))
-    quat = quat_from_yaw([one["yaw_rad"]] * 2)
+    xyz = np.tile(_rows(entry["xyz"]), (2, 1))
+    quat = quat_from_yaw([entry["yaw_rad"]] * 2)
     track = Trajectory(ego.t_us[[0, -1]], xyz, quat)
-    return Actor(one["id"], "other", Box(*one["size_m"]), track, is_static=True)
+    return Actor(entry["id"], "other", Box(*entry["size_m"]), track, is_static=True)
 
 
 def _recording(files: SourceFiles, folder: Path) -> tuple[Photograph, ...]:
@@ -294,15 +298,15 @@ def _photograph(folder: Path, frame: JsonObject) -> Photograph:
 
 def _note_files(files: SourceFiles, model: Path) -> None:
     """Enter the files of the model into the content, each by its digest: they are large."""
-    found = (
+    paths = (
         sorted(path for path in model.rglob("*") if os.path.isfile(path))
         if os.path.isdir(model)
         else []
     )
-    if not found:
+    if not paths:
         raise InputError(
             f"{model}: no model: the import was not finished",
             "give the same import command again; it goes on where it stopped",
         )
-    for path in found:
+    for path in paths:
         files.note_bytes(path.relative_to(model).as_posix(), bytes.fromhex(file_sha256(path)))

@@ -86,13 +86,13 @@ def _change(
     lengths = np.array([arc_lengths(p)[-1] for p in parts])
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     first = int(np.searchsorted(begin, at_m, side="right")) - 1
-    where = f"lane change at {at_m:.0f} m to lane {change.to_lane}"
+    location = f"lane change at {at_m:.0f} m to lane {change.to_lane}"
     if first >= len(parts):
-        raise InputError(f"{where}: the road ends at {begin[-1]:.0f} m", "change lanes earlier")
+        raise InputError(f"{location}: the road ends at {begin[-1]:.0f} m", "change lanes earlier")
     stretch = road.stretches[first]
     if change.to_lane >= len(stretch.forward) or stretch.forward[change.to_lane] is None:
         raise InputError(
-            f"{where}: element {first} has no such lane",
+            f"{location}: element {first} has no such lane",
             "choose a lane that exists there",
         )
     target = road.forward_chain(change.to_lane, first)
@@ -104,7 +104,7 @@ def _change(
         if begin[min(i, len(begin) - 1)] < at_m + change.length_m:
             if i >= len(parts) or len(parts[i]) != len(goal):
                 raise InputError(
-                    f"{where}: the lanes part at element {i}",
+                    f"{location}: the lanes part at element {i}",
                     "change lanes earlier or within a shorter length",
                 )
             share = smoothstep((begin[i] + arc_lengths(parts[i]) - at_m) / change.length_m)[:, None]

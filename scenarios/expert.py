@@ -225,7 +225,8 @@ def drive(
         lights_on(path, signals), lights_on(path, give_way), posted_mps,
     )  # fmt: skip
     cars = [
-        _Car(one, lights_on(one.path, signals), lights_on(one.path, give_way)) for one in followers
+        _Car(follower, lights_on(follower.path, signals), lights_on(follower.path, give_way))
+        for follower in followers
     ]
     lines = Lines([car.f.path for car in cars]) if cars else None
     half_widths = np.array([car.f.box.width_m / 2 for car in cars])
@@ -246,8 +247,8 @@ def drive(
             leaders = find_leaders(
                 lines, np.arange(len(cars)), fronts, half_widths, everybody, horizons, own_row
             )
-            for car, leader, own in zip(cars, leaders, own_row.tolist(), strict=True):
-                car.decide(leader, everybody, own, t)
+            for car, leader, row in zip(cars, leaders, own_row.tolist(), strict=True):
+                car.decide(leader, everybody, row, t)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(wanted, sub_s)
             log_s.append(expert.s)
@@ -353,11 +354,11 @@ class _Car:
     def front_s(self) -> float:
         return self.s + self.f.box.length_m / 2
 
-    def decide(self, leader: Leader, bodies: Bodies, own: int, t_us: int) -> None:
+    def decide(self, leader: Leader, bodies: Bodies, own_row: int, t_us: int) -> None:
         closing = self.v - leader.speed_mps
         stop_m = min(
             red_gap_m(self.lights, self.front_s, self.v, t_us),
-            give_way_gap_m(self.give_way, self.f.path, self.front_s, bodies, own),
+            give_way_gap_m(self.give_way, self.f.path, self.front_s, bodies, own_row),
         )
         params = at_place(self.params, self.f.path, self.wanted_mps, self.s)
         self.a = min(
@@ -390,16 +391,16 @@ def _predicted(
     present = [table.present[rows]]
     if lines is not None:
         s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
-        at = s + v * TIMES_S[:, None]  # (1 + n, K)
-        line = np.broadcast_to(np.arange(len(cars)), at.shape)
+        stations = s + v * TIMES_S[:, None]  # (1 + n, K)
+        line = np.broadcast_to(np.arange(len(cars)), stations.shape)
         points, heading = lines.at(
-            line.ravel(), at.ravel(), np.broadcast_to(offset, at.shape).ravel()
+            line.ravel(), stations.ravel(), np.broadcast_to(offset, stations.shape).ravel()
         )
-        heading = heading.reshape(at.shape)
-        xy.append(points[:, :2].reshape(*at.shape, 2))
+        heading = heading.reshape(stations.shape)
+        xy.append(points[:, :2].reshape(*stations.shape, 2))
         yaw.append(heading)
         velocity.append(v[:, None] * direction_of(heading))
-        present.append(at <= lines.length_m)
+        present.append(stations <= lines.length_m)
     return PredictedBodies(
         np.concatenate(xy, axis=1),
         np.concatenate(yaw, axis=1),

@@ -24,7 +24,9 @@ from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
 
 FRONT_WIDE = "camera_front_wide_120fov"
-WIDTH, HEIGHT = 512, 288  # rendered size; the recorded frames are 1920 x 1080
+# Rendered size; the recorded frames are 1920 x 1080.
+WIDTH = 512
+HEIGHT = 288
 HORIZONTAL_FOV_RAD = np.pi / 2
 
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
@@ -131,12 +133,12 @@ def sensor_lens(properties: JsonObject) -> LensModel:
         ValueError, KeyError: They are no f-theta lens.
     """
     _, polynomial, goes_back = _lens_numbers(properties)
-    given = (*polynomial, *[0.0] * (DEGREE + 1 - len(polynomial)))
+    coefficients = (*polynomial, *[0.0] * (DEGREE + 1 - len(polynomial)))
     c, d, e = (
         float(properties.get(f"linear-{name}", usual))
         for name, usual in zip("cde", LensModel.linear, strict=True)
     )
-    forward, backward = ((), given) if goes_back else (given, ())
+    forward, backward = ((), coefficients) if goes_back else (coefficients, ())
     return LensModel("ftheta", forward, backward, (c, d, e))
 
 
@@ -160,9 +162,9 @@ def calibration_table(cameras: Mapping[str, CameraSpec], clip_id: str) -> bytes:
     """
     sensors = [_sensor(name, camera) for name, camera in cameras.items()]
     text = json.dumps({"rig": {"sensors": sensors}})
-    own = pa.struct([("rig_json", pa.string())])
+    rig_type = pa.struct([("rig_json", pa.string())])
     schema = pa.schema(
-        [("key", pa.struct([("clip_id", pa.string())])), ("calibration_estimate", own)]
+        [("key", pa.struct([("clip_id", pa.string())])), ("calibration_estimate", rig_type)]
     )
     stream = io.BytesIO()
     pq.write_table(

@@ -51,7 +51,8 @@ TOWN_SIGN = {"de310": 50.0}  # km/h
 SPEED = re.compile(r"(\d+(?:\.\d+)?)\s*(km/h|kmh|mph|m/s|mps|)", re.ASCII)
 MPS = {"km/h": 1 / 3.6, "kmh": 1 / 3.6, "": 1 / 3.6, "mph": 0.44704, "m/s": 1.0, "mps": 1.0}
 JUNCTION_M = 60.0  # lights whose lines lie nearer to each other belong to one junction
-SIGN_M, PLATE_M = 2.1, 0.6  # height of signs, and of a sign itself
+SIGN_M = 2.1  # height at which signs stand
+PLATE_M = 0.6  # height of a sign itself
 LAMPS_M = 0.9  # height of a light whose map does not state it
 
 
@@ -114,8 +115,8 @@ class Osm:
             tags = {str(tag.get("k")): str(tag.get("v")) for tag in element.iter("tag")}
             nodes = [("node", "", str(nd.get("ref"))) for nd in element.iter("nd")]
             members = [
-                (str(one.get("type")), str(one.get("role")), str(one.get("ref")))
-                for one in element.iter("member")
+                (str(member.get("type")), str(member.get("role")), str(member.get("ref")))
+                for member in element.iter("member")
             ]
             of_kind[key] = Item(tags, (*nodes, *members))
             if element.tag == "node":
@@ -127,8 +128,8 @@ class Osm:
 
     def relations(self, kind: str) -> dict[str, Item]:
         """Return the relations of one type."""
-        found = self.items["relation"].items()
-        return {key: item for key, item in found if item.tags.get("type") == kind}
+        relations = self.items["relation"].items()
+        return {key: item for key, item in relations if item.tags.get("type") == kind}
 
     def ways(self, kind: str) -> list[str]:
         """Return the ways of one type."""
@@ -168,12 +169,12 @@ class Osm:
 
     def _used_ways(self) -> list[str]:
         beside = ("stop_line", "traffic_sign")
-        found = [key for kind in beside for key in self.ways(kind)]
+        ways = [key for kind in beside for key in self.ways(kind)]
         for lanelet in self.lanelets.values():
-            found += [*lanelet.of("left", "way"), *lanelet.of("right", "way")]
+            ways += [*lanelet.of("left", "way"), *lanelet.of("right", "way")]
         for rule in self.rules.values():
-            found += [*rule.of("ref_line", "way"), *rule.of("refers", "way")]
-        return found
+            ways += [*rule.of("ref_line", "way"), *rule.of("refers", "way")]
+        return ways
 
     def _placed(
         self, places: Mapping[str, Mapping[str, str]]
@@ -276,8 +277,8 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
     lengths = {key: float(arc_lengths(lane.centre)[-1]) for key, lane in lanes.items()}
 
     def spots(name: str, s_m: float) -> list[Spot]:
-        there = {name: s_m, f"-{name}": lengths[name] - s_m}
-        return [Spot(key, at_m) for key, at_m in there.items() if key in lanes]
+        stations = {name: s_m, f"-{name}": lengths[name] - s_m}
+        return [Spot(key, at_m) for key, at_m in stations.items() if key in lanes]
 
     notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     notes += [f"{n} lanelets of type {text}" for text, n in sorted(reserved.items())]
@@ -513,13 +514,13 @@ def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64 | None]:
 
 def _give_way(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Signal, ...]:
     """Return the lines at which lanelets give way, where no traffic light goes before the rule."""
-    found = []
+    lines = []
     for ref, rule in osm.rules.items():
         if rule.tags.get("subtype") == "right_of_way" and rule.tags.get("fallback") != "yes":
             line = next(iter(rule.of("ref_line", "way")), "")
             keys = [key for key in rule.of("yield", "relation") if key in lanes]
-            found += [_stop(osm, line, ref, [lanes[key]]) for key in keys]
-    return tuple(found)
+            lines += [_stop(osm, line, ref, [lanes[key]]) for key in keys]
+    return tuple(lines)
 
 
 def _stop(osm: Osm, line: str, name: str, lanes: Sequence[Lane]) -> Signal:

@@ -44,7 +44,7 @@ from scenarios.recorded import RecordedLog
 from scenarios.schema import VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
 from scenarios.suite import ScenarioRef, find
-from scenarios.variation import Drawn, draw
+from scenarios.variation import SceneDraft, draw
 
 RECORDED_STREETS = ("usdz", "drive")  # sources whose street is recorded, whatever renders it
 ALPASIM_WARMUP_US = 1_700_000  # its default force_gt_duration_us
@@ -74,37 +74,37 @@ def load_scenario(
         InputError: Anything wrong with the input, with file, line and column where there is one.
     """
     document = open_document(find(path_or_name), source)
-    drawn = draw(document, seed, overrides)
+    draft = draw(document, seed, overrides)
     # The scenario file enters as the resolved specification; everything else that is read, by its
     # content.
     with Inputs() as inputs:
-        return _loaded(drawn, source, inputs)
+        return _loaded(draft, source, inputs)
 
 
-def _loaded(drawn: Drawn, source: str | None, inputs: Inputs) -> Scenario:
+def _loaded(draft: SceneDraft, source: str | None, inputs: Inputs) -> Scenario:
     """Read what a specification names, and make the scenario of it."""
-    cameras = given_cameras(drawn)
-    default = drawn.spec.vehicle or VehicleSpec()
-    if drawn.spec.road is not None:
-        drive = built_drive(drawn, _vehicle(default))
-    elif drawn.spec.map is not None:
+    cameras = given_cameras(draft)
+    default = draft.spec.vehicle or VehicleSpec()
+    if draft.spec.road is not None:
+        drive = built_drive(draft, _vehicle(default))
+    elif draft.spec.map is not None:
         from scenarios.map_drive import map_drive
 
-        drive = map_drive(drawn, _vehicle(default))
+        drive = map_drive(draft, _vehicle(default))
     else:
-        drive = recorded_drive(drawn, source)
-    check_record(drive, drawn.document.path)
-    scenario = _scenario(drawn, drive, cameras or drive.cameras or (camera_spec(),))
+        drive = recorded_drive(draft, source)
+    check_record(drive, draft.document.path)
+    scenario = _scenario(draft, drive, cameras or drive.cameras or (camera_spec(),))
     for path in scenario.shown_files:
         content_of(path)
     inputs.setting("scene", scenario.content_hash)
     scenario = replace(scenario, content_hash=inputs.key, files=inputs.files)
     if cameras is not None:
-        check_mounts(drawn, cameras, scenario.vehicle)
-    check_scenario(scenario, drawn.document.path)
+        check_mounts(draft, cameras, scenario.vehicle)
+    check_scenario(scenario, draft.document.path)
     if scenario.source != "usdz":  # the map of an AlpaSim scene is in its form already
         scenario = replace(scenario, alpasim_map=alpasim_view(scenario.lane_map))
-    _check_timing(drawn, scenario)
+    _check_timing(draft, scenario)
     return scenario
 
 
@@ -117,37 +117,36 @@ def scene_id_of(ref: ScenarioRef) -> str:
     path = find(ref.path)
     if path.suffix not in (".yaml", ".yml"):
         return load_scenario(ref.path, ref.seed, ref.overrides, ref.source).scene_id
-    drawn = draw(open_document(path, ref.source), ref.seed, ref.overrides)
-    return _with_seed(drawn, drawn.spec.scene_id or drawn.scene_id)
+    draft = draw(open_document(path, ref.source), ref.seed, ref.overrides)
+    return _with_seed(draft, draft.spec.scene_id or draft.scene_id)
 
 
-def _with_seed(drawn: Drawn, scene_id: str) -> str:
+def _with_seed(draft: SceneDraft, scene_id: str) -> str:
     """Return the id of a scene, which names a seed that is another one than its file's."""
-    return f"{scene_id}-seed{drawn.spec.seed}" if drawn.reseeded else scene_id
+    return f"{scene_id}-seed{draft.spec.seed}" if draft.reseeded else scene_id
 
 
 def code_digest_of(scenario: Scenario) -> str | None:
     """Return what identifies the code that made a scenario: this package's, and that of its source;
     None where it has no digest.
     """
-    own = package_digest()
+    package = package_digest()
     if scenario.source_part is None:
-        return own
+        return package
     source = source_digest(scenario.source_part)
-    return None if source is None else digest([own, source])
+    return None if source is None else digest([package, source])
 
 
-def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...]) -> Scenario:
+def _scenario(draft: SceneDraft, drive: RecordedLog, cameras: tuple[CameraSpec, ...]) -> Scenario:
     """Put the settings of the specification beside a map, a drive and its traffic."""
-    spec = drawn.spec
-    timing = drawn.spec.timing
-    kind = None if drawn.spec.log is None else drawn.spec.log.recorded[0]
-    is_file = Path(drawn.document.path).suffix in (".yaml", ".yml")
-    scene_id = spec.scene_id or (
-        drawn.scene_id if is_file else drive.scene_id
-    )  # a bare log keeps its id whatever is overridden
-    start, end = _window(drawn, drive)
-    background = _background(drawn)
+    spec = draft.spec
+    timing = draft.spec.timing
+    kind = None if draft.spec.log is None else draft.spec.log.recorded[0]
+    is_file = Path(draft.document.path).suffix in (".yaml", ".yml")
+    # A bare log keeps its id whatever is overridden.
+    scene_id = spec.scene_id or (draft.scene_id if is_file else drive.scene_id)
+    start, end = _window(draft, drive)
+    background = _background(draft)
     # Where the street itself is built its markings are chosen; those that nobody knows of a recorded
     # street stays unknown.
     recorded = drive.source in RECORDED_STREETS or (
@@ -156,7 +155,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
     lane_map = drive.lane_map if recorded else with_default_markings(drive.lane_map)
     route, beyond = _route(drive, (end - start) * 1e-6)
     return Scenario(
-        scene_id=_with_seed(drawn, scene_id),
+        scene_id=_with_seed(draft, scene_id),
         source=drive.source,
         seed=spec.seed,
         lane_map=lane_map,
@@ -167,7 +166,7 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
             friction=spec.environment.friction,
         ),
         route=route,
-        actors=_actors(drawn, drive),
+        actors=_actors(draft, drive),
         cameras=cameras,
         rates=Rates(**spec.rates.model_dump()),
         start_us=start,
@@ -178,11 +177,11 @@ def _scenario(drawn: Drawn, drive: RecordedLog, cameras: tuple[CameraSpec, ...])
         degradation=Degradation(**spec.degradation.model_dump()),
         background=background,
         world_origin=drive.world_origin,
-        content_hash=_hash(drawn, scene_id, drive.content_hash),
+        content_hash=_hash(draft, scene_id, drive.content_hash),
         notes=drive.notes,
         alpasim_map=drive.alpasim_map,
         source_part=kind,
-        varied=drawn.varied,
+        varied=draft.varied,
         recording=drive.recording,
         model=drive.model,
         standing=drive.standing,
@@ -210,36 +209,36 @@ def _route(drive: RecordedLog, seconds: float) -> tuple[Route, F64]:
     return route, nothing if ends else before_end(ahead, drive.vehicle)
 
 
-def _window(drawn: Drawn, drive: RecordedLog) -> tuple[int, int]:
+def _window(draft: SceneDraft, drive: RecordedLog) -> tuple[int, int]:
     """Return the times of the first frame and of the end."""
-    timing = drawn.spec.timing
+    timing = draft.spec.timing
     first = int(drive.ego_log.t_us[0])
     last = int(drive.ego_log.t_us[-1])
     start = first + timing.start_us
-    if drawn.spec.road is not None:
-        return start + timing.start_time_offset_us, drawn.spec.built_until_us
+    if draft.spec.road is not None:
+        return start + timing.start_time_offset_us, draft.spec.built_until_us
     if timing.timeline == "alpasim" and drive.first_frame_us is not None:
         start = drive.first_frame_us
     start += timing.start_time_offset_us
     end = last if timing.duration_us is None else start + timing.duration_us
     if end > last:
-        found = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
-        raise drawn.document.error(
-            ("timing", "duration_us"), found, "shorten timing.duration_us or leave it out"
+        fault = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
+        raise draft.document.error(
+            ("timing", "duration_us"), fault, "shorten timing.duration_us or leave it out"
         )
     return start, end
 
 
-def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
+def _actors(draft: SceneDraft, drive: RecordedLog) -> tuple[Actor, ...]:
     """Return the traffic; that of a recorded log is replayed, reacts, or is left out, as
     ``log.actors`` says.
     """
-    log = drawn.spec.log
+    log = draft.spec.log
     if log is None:
-        files = {one.id: _appearance(drawn, i) for i, one in enumerate(drawn.spec.actors)}
+        files = {one.id: _appearance(draft, i) for i, one in enumerate(draft.spec.actors)}
         for i, name in enumerate(files):
             if files[name] and name not in {actor.actor_id for actor in drive.actors}:
-                raise drawn.document.error(
+                raise draft.document.error(
                     ("actors", i, "appearance"),
                     f"{name!r} is a row of several vehicles",
                     "give each vehicle an entry of its own",
@@ -250,11 +249,11 @@ def _actors(drawn: Drawn, drive: RecordedLog) -> tuple[Actor, ...]:
     return () if log.actors == "none" else tuple(_reactive(actor) for actor in drive.actors)
 
 
-def _appearance(drawn: Drawn, i: int) -> str | None:
+def _appearance(draft: SceneDraft, i: int) -> str | None:
     """Return the file of an actor's Gaussians; None where it is built."""
     document, file, key = (
-        drawn.document,
-        drawn.spec.actors[i].appearance,
+        draft.document,
+        draft.spec.actors[i].appearance,
         ("actors", i, "appearance"),
     )
     if file is None:
@@ -274,10 +273,10 @@ def _reactive(actor: Actor) -> Actor:
     return replace(actor, behaviour=Behaviour("idm", {"desired_speed_mps": max(top_mps, 2.0)}))
 
 
-def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
+def _check_timing(draft: SceneDraft, scenario: Scenario) -> None:
     """Check the periods and the length with the loop's own clock."""
-    document = drawn.document
-    timing = drawn.spec.timing
+    document = draft.document
+    timing = draft.spec.timing
     control_us = scenario.rates.control_us
     warmup_us = scenario.warmup_us
     try:
@@ -294,25 +293,25 @@ def _check_timing(drawn: Drawn, scenario: Scenario) -> None:
         loc: tuple[str, ...] = ("rates", key) if key else ("timing", "duration_us")
         raise document.error(loc, f"{e.message}", e.hint) from e
     if timing.timeline == "alpasim" and warmup_us % control_us:
-        found = f"a control period of {control_us} us, of which {warmup_us} us is not a multiple"
+        fault = f"a control period of {control_us} us, of which {warmup_us} us is not a multiple"
         raise document.error(
             ("timing", "timeline"),
-            found,
+            fault,
             "choose a rates.control_us that divides AlpaSim's 1.7 s",
         )
     if timing.start_time_offset_us and timing.timeline != "alpasim":
-        found = f"an offset of {timing.start_time_offset_us} us in the scenario's own time line"
+        fault = f"an offset of {timing.start_time_offset_us} us in the scenario's own time line"
         raise document.error(
             ("timing", "start_time_offset_us"),
-            found,
+            fault,
             "set timing.start_us, or timing.timeline: alpasim",
         )
     length_us = clock.n_steps * control_us
     if warmup_us >= length_us:
-        found = f"warmup_us = {warmup_us} of a scene of {length_us} us: nothing is left to drive"
+        fault = f"warmup_us = {warmup_us} of a scene of {length_us} us: nothing is left to drive"
         raise document.error(
             ("timing", "warmup_us"),
-            found,
+            fault,
             "shorten timing.warmup_us or lengthen timing.duration_us",
         )
 
@@ -322,9 +321,9 @@ def _vehicle(v: VehicleSpec) -> Vehicle:
     return Vehicle(Box(v.length_m, v.width_m, v.height_m), **chassis)
 
 
-def _background(drawn: Drawn) -> BackgroundFile | None:
-    document = drawn.document
-    background = drawn.spec.background
+def _background(draft: SceneDraft) -> BackgroundFile | None:
+    document = draft.document
+    background = draft.spec.background
     if background is None:
         return None
     path = document.folder_of(("background", "file")) / background.file
@@ -332,19 +331,19 @@ def _background(drawn: Drawn) -> BackgroundFile | None:
         raise document.error(("background", "file"), f"{path} does not exist", "correct the path")
     matrix = np.eye(4) if background.transform is None else np.array(background.transform)
     if abs(np.linalg.det(matrix[:3, :3])) < 1e-12 or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        found = "no inverse, or a last row other than 0 0 0 1"
-        raise document.error(("background", "transform"), found, "give rotation, scale and shift")
+        fault = "no inverse, or a last row other than 0 0 0 1"
+        raise document.error(("background", "transform"), fault, "give rotation, scale and shift")
     return BackgroundFile(str(path), matrix, background.keep_road)
 
 
-def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
+def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
     """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of
     every data file.
 
     Words for people, the places where data files lie, and where a rollout ends do not matter: they
     do not change the scene.
     """
-    spec = drawn.spec
+    spec = draft.spec
     content = spec.model_dump(
         mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}}
     )
@@ -357,7 +356,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
         _drop(actor, ("yields",) if actor.get("role") else ("yields", "role", "gap_m"))
         _drop(actor, ("appearance",))
         if "appearance" in actor:
-            folder = drawn.document.folder_of(("actors", i, "appearance"))
+            folder = draft.document.folder_of(("actors", i, "appearance"))
             actor["appearance"] = file_sha256(folder / actor["appearance"])
     if spec.map is None:
         del content["map"]
@@ -368,7 +367,7 @@ def _hash(drawn: Drawn, scene_id: str, source_hash: str) -> str:
         content["background"]["file"] = "given by its content"
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())
     if spec.background is not None:
-        file = drawn.document.folder_of(("background", "file")) / spec.background.file
+        file = draft.document.folder_of(("background", "file")) / spec.background.file
         scene.update(bytes.fromhex(file_sha256(file)))
     return scene.hexdigest()
 

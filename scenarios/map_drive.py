@@ -30,7 +30,7 @@ from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
 from scenarios.street_map import CYCLE, GREEN_S, Head, StreetMap, with_cycles
-from scenarios.variation import Drawn
+from scenarios.variation import SceneDraft
 
 READERS = {"opendrive": opendrive.read_street, "lanelet2": lanelet2.read_street}
 ROUTE_M = 200.0  # length of a route that is drawn
@@ -41,32 +41,33 @@ AHEAD_M = 120.0  # the route goes on so far behind the end of the drive
 AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
 DRIVEN_GAP_M = 1.0  # links across wider gaps are not driven
 LONGEST_S = 300.0  # of a drive
-MOST_INSIDE_M, EASED_M = 0.6, 1.5  # in bends: from the middle of the lane, over this length
+MOST_INSIDE_M = 0.6  # in bends: from the middle of the lane
+EASED_M = 1.5  # length over which that offset is smoothed
 YELLOW_AHEAD_S = 4.0  # before the ego, on a free road, would pass the first light of its route
 
 
-def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
+def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     """Read a map, choose a route on it and let the expert drive it.
 
     Args:
-        drawn: Specification with ``map``.
+        draft: Specification with ``map``.
         vehicle: Ego vehicle.
 
     Raises:
         InputError: A map that cannot be read, a place that it does not have, or no way between two
             places, with the position of its key.
     """
-    spec = drawn.spec
+    spec = draft.spec
     assert spec.map is not None
     kind, text = spec.map.source
-    path = drawn.document.folder_of(("map", kind)) / text
+    path = draft.document.folder_of(("map", kind)) / text
     files = SourceFiles()
     with parsing(path, "repair this map, or use another one"):
         street = READERS[kind](files, path)
     street, gap_notes = _without_gaps(street)
     graph = LaneGraph(street.lanes)
-    with drawn.at("map", "route"):
-        way = _way(drawn, spec.map, graph, street)
+    with draft.at("map", "route"):
+        way = _way(draft, spec.map, graph, street)
     if not any(way.lane_ids[0] in lane.successors for lane in street.lanes.values()):
         way = replace(way, start_m=max(way.start_m, REAR_M))
     goal_m = graph.line(way).length_m - way.beyond_m
@@ -81,7 +82,9 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         lane_map,
         signals=_timed(heads, line, front_m, spec.ego.cruise_mps),
         give_way=tuple(
-            one for one in street.give_way if any(key in lane_map.lanes for key in one.lanes)
+            signal
+            for signal in street.give_way
+            if any(key in lane_map.lanes for key in signal.lanes)
         ),
     )
     keep = line.s <= goal_m + front_m + 1.0
@@ -92,7 +95,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
     end_us = round(LONGEST_S * 1e6)
     if duration_us is not None:
         end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
-    rng = stream(drawn.scene_id, spec.seed, "scenario/map/vehicles")
+    rng = stream(draft.scene_id, spec.seed, "scenario/map/vehicles")
     followers = place_followers(lane_map, way, line, spec.map.vehicles, rng)
     walkers = place_walkers(
         lane_map,
@@ -101,7 +104,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         spec.ego.cruise_mps,
         spec.map.pedestrians,
         grid(end_us),
-        stream(drawn.scene_id, spec.seed, "scenario/map/pedestrians"),
+        stream(draft.scene_id, spec.seed, "scenario/map/pedestrians"),
     )
     ego_log, vehicles = drive(
         driven,
@@ -116,7 +119,7 @@ def map_drive(drawn: Drawn, vehicle: Vehicle) -> RecordedLog:
         graph.limits_mps(way, driven),
     )
     return RecordedLog(
-        drawn.scene_id,
+        draft.scene_id,
         kind,
         lane_map,
         ground_of(lane_map, ego_log.xyz),
@@ -155,13 +158,13 @@ def _up_to_goal(line: Path, goal_m: float, driven: F64) -> F64:
     return remaining(line.at(stations)[0], with_last(driven, TRACKED_EVERY))
 
 
-def _way(drawn: Drawn, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:
+def _way(draft: SceneDraft, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:
     """Return the route: between two places, or with an end that is drawn."""
     named = spec.route if isinstance(spec.route, MapRoute) else MapRoute()
     starts, goals = (
         None if text is None else _spots(text, graph, street) for text in (named.from_, named.to)
     )
-    rng = stream(drawn.scene_id, drawn.spec.seed, "scenario/map/route")
+    rng = stream(draft.scene_id, draft.spec.seed, "scenario/map/route")
     best: Way | None = None
     longest_m = 0.0
     for _ in range(DRAWS):
@@ -270,10 +273,10 @@ def _timed(
     if first is not None:
         number = next(n for n, signal in enumerate(signals) if signal is first.signal)
         head = heads[number]
-        shown = with_cycles(heads, {})[number]
+        timed_signal = with_cycles(heads, {})[number]
         arrival_s = (first.s_m - front_m) / cruise_mps
         green_us = round((arrival_s - YELLOW_AHEAD_S - GREEN_S) * 1e6)
-        begins_us[head.junction] = green_us - shown.offset_us
+        begins_us[head.junction] = green_us - timed_signal.offset_us
     return with_cycles(heads, begins_us)
 
 

@@ -26,20 +26,18 @@ from alpasim_plugin.world.path import polyline_path, thinned
 
 MAX_STEP_M = 2.0
 
-NO_LANES_OF_CARS = (
-    "sidewalk",
-)  # every other kind counts: without shoulders the distance to the lane boundary is half a metre off
+# Every other kind counts: without shoulders the distance to the lane boundary is half a metre off.
+NO_LANES_OF_CARS = ("sidewalk",)
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
 MEET_M = 0.1  # linked lanes whose ends lie farther apart do not meet
 MIN_HOLE_M2 = 0.5  # smaller holes are seams too
 STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
 
-LANE_M, BEFORE_M, BEYOND_M, VERTEX_M = (
-    3.5,
-    8.0,
-    15.0,
-    1.0,
-)  # of the corridor: width, how far it goes on, distance of vertices
+# Of the corridor.
+LANE_M = 3.5  # width
+BEFORE_M = 8.0  # how far it goes on before the path
+BEYOND_M = 15.0  # how far it goes on beyond the path
+VERTEX_M = 1.0  # between vertices
 
 
 def lane_edges(lanes: Mapping[str, Lane]) -> list[F64]:
@@ -136,15 +134,18 @@ def same_way(lane: Lane, lanes: Mapping[str, Lane], name: str | None) -> str | N
     """Return the name of a neighbour; None for one that is not there, or is driven the other way."""
     if name is None or name not in lanes:
         return None
-    own, other = ((one.centre[-1] - one.centre[0])[:2] for one in (lane, lanes[name]))
-    return name if own @ other > 0 else None
+    neighbour = lanes[name]
+    direction = (lane.centre[-1] - lane.centre[0])[:2]
+    neighbour_direction = (neighbour.centre[-1] - neighbour.centre[0])[:2]
+    return name if direction @ neighbour_direction > 0 else None
 
 
-def is_left_of(one: F64, other: F64) -> bool:
-    """Return whether ``one`` ``(N, 2+)`` runs on the left of ``other``: the ring one + reversed
-    other is clockwise.
+def is_left_of(line: F64, other: F64) -> bool:
+    """Return whether ``line`` ``(N, 2+)`` runs on the left of ``other``.
+
+    The ring of ``line`` and the reversed ``other`` is clockwise then.
     """
-    x, y = np.concatenate([one[:, :2], other[::-1, :2]]).T
+    x, y = np.concatenate([line[:, :2], other[::-1, :2]]).T
     return bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0)
 
 

@@ -13,7 +13,8 @@ from alpasim_plugin.world.path import Path, smooth_path, smoothstep
 STATION_M = 2.0  # of the driven line, which is smooth in between
 CHANGE_M = 40.0  # length of a lane change, where the lanes are as long
 SHORTEST_CHANGE_M = 20.0
-NARROWEST_M, WIDEST_M = 2.2, 15.0  # of a lane on which a car fits, and whose edges run together
+NARROWEST_M = 2.2  # of a lane on which a car fits
+WIDEST_M = 15.0  # of a lane whose edges run together
 CHANGE_COST_M = 50.0  # a way is so much longer before a lane change is worth it
 
 
@@ -58,8 +59,8 @@ class LaneGraph:
     def beside(self, lane_id: str) -> tuple[str, ...]:
         """Return the neighbours of a lane into which one may change."""
         lane = self.lanes[lane_id]
-        both = (lane.left_neighbour, lane.right_neighbour)
-        return tuple(key for key in both if key is not None and key in self.lanes)
+        neighbours = (lane.left_neighbour, lane.right_neighbour)
+        return tuple(key for key in neighbours if key is not None and key in self.lanes)
 
     def drawn_spot(self, rng: np.random.Generator) -> Spot:
         """Draw a place, lanes by their length, outside of junctions where there is one."""
@@ -133,12 +134,12 @@ class LaneGraph:
             points = resample(self.lanes[key].centre, stations)
             if ids and ids[0] in self.beside(key):
                 other = ids.pop(0)
-                there = resample(
+                other_points = resample(
                     self.lanes[other].centre, [self._abreast(key, other, s) for s in stations]
                 )
                 length_m = min(CHANGE_M, self.length_m[key] - begin_m)
                 share = smoothstep((stations - begin_m) / length_m)[:, None]
-                points = (1 - share) * points + share * there
+                points = (1 - share) * points + share * other_points
             if parts and np.linalg.norm(points[0] - parts[-1][-1]) < STATION_M / 2:
                 points = points[1:]
             if len(points):
@@ -152,7 +153,8 @@ class LaneGraph:
     def limits_mps(self, way: Way, line: Path) -> F64:
         """Return the speed limit at each vertex of a way's line; infinite where none is known."""
         after = (*way.lane_ids[1:], "")
-        lengths = [  # a lane that one changes from lies beside the next one
+        # A lane that one changes from lies beside the next one.
+        lengths = [
             0.0 if then in self.beside(key) else self.length_m[key]
             for key, then in zip(way.lane_ids, after, strict=True)
         ]

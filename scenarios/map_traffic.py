@@ -33,7 +33,7 @@ TRIES = 8  # for each vehicle
 
 
 @dataclass(frozen=True)
-class _Drawn:
+class _Ride:
     """A vehicle's way, and the lines at which it waits."""
 
     way: Way
@@ -56,12 +56,12 @@ def place_followers(
     """
     graph = LaneGraph(lane_map.lanes)
 
-    def drawn(of_way: Way, path: Path) -> _Drawn:
+    def ride_on(of_way: Way, path: Path) -> _Ride:
         lights = lights_on(path, lane_map.signals)
-        return _Drawn(of_way, path, lights, lights_on(path, lane_map.give_way))
+        return _Ride(of_way, path, lights, lights_on(path, lane_map.give_way))
 
     followers: list[Follower] = []
-    taken = [drawn(way, line)]
+    rides = [ride_on(way, line)]
     for _ in range(TRIES * count):
         if len(followers) == count:
             break
@@ -71,43 +71,45 @@ def place_followers(
         own_way = graph.carried_on(start, WAY_M)
         if own_way.beyond_m < SHORTEST_WAY_M:
             continue
-        own = drawn(own_way, graph.line(own_way))
-        if any(_too_close(own, other) or not _is_ruled(own, other) for other in taken):
+        candidate = ride_on(own_way, graph.line(own_way))
+        if any(_too_close(candidate, other) or not _is_ruled(candidate, other) for other in rides):
             continue
-        taken.append(own)
-        posted_mps = max(float(graph.limits_mps(own_way, own.path).min()), SLOWEST_MPS)
+        rides.append(candidate)
+        posted_mps = max(float(graph.limits_mps(own_way, candidate.path).min()), SLOWEST_MPS)
         wanted_mps = min(wanted_mps, posted_mps)
         params = {"desired_speed_mps": wanted_mps, "lateral_accel_mps2": BEND_MPS2}
-        begin_mps = float(allowed_speeds(own.path, wanted_mps, BEND_MPS2)[0])
+        begin_mps = float(allowed_speeds(candidate.path, wanted_mps, BEND_MPS2)[0])
         name = f"car-{len(followers)}"
-        followers.append(Follower(name, "car", own.path, 0.0, begin_mps, SIZES["car"], params))
+        followers.append(
+            Follower(name, "car", candidate.path, 0.0, begin_mps, SIZES["car"], params)
+        )
     return followers
 
 
-def _too_close(one: _Drawn, other: _Drawn) -> bool:
-    return float(np.hypot(*(one.path.xyz[0] - other.path.xyz[0])[:2])) < ROOM_M
+def _too_close(ride: _Ride, other: _Ride) -> bool:
+    return float(np.hypot(*(ride.path.xyz[0] - other.path.xyz[0])[:2])) < ROOM_M
 
 
-def _is_ruled(one: _Drawn, other: _Drawn) -> bool:
+def _is_ruled(ride: _Ride, other: _Ride) -> bool:
     """Return whether it is clear who goes first where two ways cross or join; from one lane on,
     they follow each other. Nobody drives against another one on one lane.
     """
     tree = scipy.spatial.KDTree(other.path.xyz[::EVERY, :2])
-    apart_m, row = tree.query(one.path.xyz[::EVERY, :2])
+    apart_m, row = tree.query(ride.path.xyz[::EVERY, :2])
     close = np.flatnonzero(apart_m < CLOSE_M)
     if not len(close):
         return True
-    turned_rad = one.path.yaw[::EVERY][close] - other.path.yaw[::EVERY][row[close]]
+    turned_rad = ride.path.yaw[::EVERY][close] - other.path.yaw[::EVERY][row[close]]
     if np.cos(turned_rad).min() < HEAD_ON:
         return False
-    if one.way.lane_ids[0] in other.way.lane_ids or other.way.lane_ids[0] in one.way.lane_ids:
+    if ride.way.lane_ids[0] in other.way.lane_ids or other.way.lane_ids[0] in ride.way.lane_ids:
         return True
     meets = [
-        (one, one.path.s[EVERY * close[0]]),
+        (ride, ride.path.s[EVERY * close[0]]),
         (other, other.path.s[EVERY * row[close].min()]),
     ]
-    gives = [_before(drawn.give_way, s_m) is not None for drawn, s_m in meets]
-    lights = [_before(drawn.lights, s_m) for drawn, s_m in meets]
+    gives = [_before(meeting.give_way, s_m) is not None for meeting, s_m in meets]
+    lights = [_before(meeting.lights, s_m) for meeting, s_m in meets]
     first, second = lights
     if first is not None and second is not None:
         cycle_us = sum(lasts_us for _, lasts_us in first.signal.phases)
@@ -120,5 +122,5 @@ def _is_ruled(one: _Drawn, other: _Drawn) -> bool:
 
 def _before(lines: tuple[LightAhead, ...], s_m: float) -> LightAhead | None:
     """Return the last line before a place."""
-    found = [line for line in lines if 0.0 <= s_m - line.s_m <= RULED_M]
-    return found[-1] if found else None
+    candidates = [line for line in lines if 0.0 <= s_m - line.s_m <= RULED_M]
+    return candidates[-1] if candidates else None

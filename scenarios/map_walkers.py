@@ -52,12 +52,12 @@ def place_walkers(
         if not len(inside) or driven.s[inside[0]] < FIRST_M:
             continue
         row = inside[len(inside) // 2]
-        own = [one.signal for one in lights if 0.0 <= driven.s[row] - one.s_m < LIGHT_M]
-        if own or all(np.hypot(*(stop - middle)) >= LIGHT_M for stop in stops):
-            places.append((ring, row, own))
+        signals = [light.signal for light in lights if 0.0 <= driven.s[row] - light.s_m < LIGHT_M]
+        if signals or all(np.hypot(*(stop - middle)) >= LIGHT_M for stop in stops):
+            places.append((ring, row, signals))
     walkers = []
     for number, chosen in enumerate(rng.permutation(len(places))[:count]):
-        ring, row, own = places[chosen]
+        ring, row, signals = places[chosen]
         start, goal = _ends(ring, float(driven.yaw[row]), float(driven.xyz[row, 2]))
         if rng.random() < 0.5:
             start, goal = goal, start
@@ -65,10 +65,10 @@ def place_walkers(
         there_s = (driven.s[row] - front_m) / cruise_mps + float(rng.uniform(*LATE_S))
         walked_m = float(np.hypot(*(driven.xyz[row] - start)[:2]))
         begin_us = round((there_s - walked_m / speed_mps) * 1e6)
-        if own:
+        if signals:
             # The last time at which the light has turned red.
-            cycle_us = sum(lasts_us for _, lasts_us in own[-1].phases)
-            turns_us = own[-1].offset_us + cycle_us - own[-1].phases[-1][1]
+            cycle_us = sum(lasts_us for _, lasts_us in signals[-1].phases)
+            turns_us = signals[-1].offset_us + cycle_us - signals[-1].phases[-1][1]
             n_cycles = (round(there_s * 1e6) - turns_us) // cycle_us
             begin_us = turns_us + n_cycles * cycle_us + AFTER_RED_US
         box = SIZES["pedestrian"]

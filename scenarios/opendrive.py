@@ -97,10 +97,10 @@ def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> tuple[dict[str, Lane], 
                 if key not in out:
                     continue
                 ahead = _ahead(road, index, lane, roads, turns)
-                found = tuple(dict.fromkeys(k for k in ahead if k in lanes))
-                out[key] = replace(out[key], successors=found)
+                successors = tuple(dict.fromkeys(k for k in ahead if k in lanes))
+                out[key] = replace(out[key], successors=successors)
                 link = road.successor if driven_along(road, lane) else road.predecessor
-                if not found and link is not None and out[key].kind == "vehicle":
+                if not successors and link is not None and out[key].kind == "vehicle":
                     ends.append(key)
     if ends:
         notes.append(
@@ -118,26 +118,31 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
     """
     turns: dict[tuple[str, str, int], list[tuple[str, bool, int]]] = {}
     n_bare = 0
-    for one in odr.connections:
-        incoming = roads.get(one.incoming)
-        connecting = roads.get(one.connecting)
+    for connection in odr.connections:
+        incoming = roads.get(connection.incoming)
+        connecting = roads.get(connection.connecting)
         if incoming is None or connecting is None:
             continue
         after = incoming.successor
-        from_start = after is None or (after.kind, after.target) != ("junction", one.junction)
-        links = one.lanes
+        from_start = after is None or (after.kind, after.target) != (
+            "junction",
+            connection.junction,
+        )
+        links = connection.lanes
         if not links:
             n_bare += 1
             # Both roads run the same way unless they meet start to start, or end to end.
-            sign = -1 if from_start == one.at_start else 1
-            here = incoming.sections[0 if from_start else -1 :][:1]
-            links = tuple((lane.lane_id, sign * lane.lane_id) for s in here for lane in s.lanes)
+            sign = -1 if from_start == connection.at_start else 1
+            end_section = incoming.sections[0 if from_start else -1 :][:1]
+            links = tuple(
+                (lane.lane_id, sign * lane.lane_id) for s in end_section for lane in s.lanes
+            )
         for a, b in links:
-            key = one.junction, one.incoming, a
-            turns.setdefault(key, []).append((one.connecting, one.at_start, b))
-            if one.direct:
-                key = one.junction, one.connecting, b
-                turns.setdefault(key, []).append((one.incoming, from_start, a))
+            key = connection.junction, connection.incoming, a
+            turns.setdefault(key, []).append((connection.connecting, connection.at_start, b))
+            if connection.direct:
+                key = connection.junction, connection.connecting, b
+                turns.setdefault(key, []).append((connection.incoming, from_start, a))
     return turns, n_bare
 
 
@@ -153,10 +158,10 @@ def _ahead(
     if link is None:
         return []
     if link.kind == "junction":
-        found = turns.get((link.target, road.road_id, lane.lane_id), [])
+        connected = turns.get((link.target, road.road_id, lane.lane_id), [])
         return [
             lane_key(roads[r], 0 if at_start else len(roads[r].sections) - 1, i)
-            for r, at_start, i in found
+            for r, at_start, i in connected
         ]
     target = roads.get(link.target)
     if target is None or not target.sections:
@@ -166,10 +171,11 @@ def _ahead(
         back = target.predecessor if link.at_start else target.successor
         joins = back is not None and (back.kind, back.target) == ("road", road.road_id)
         linked = tuple(
-            one.lane_id
-            for one in target.sections[entered].lanes
-            if lane.lane_id in (one.predecessors if link.at_start else one.successors)
-            and driven_along(target, one) == link.at_start
+            target_lane.lane_id
+            for target_lane in target.sections[entered].lanes
+            if lane.lane_id
+            in (target_lane.predecessors if link.at_start else target_lane.successors)
+            and driven_along(target, target_lane) == link.at_start
             and joins
         )
     return [lane_key(target, entered, i) for i in linked]
@@ -234,7 +240,7 @@ def T_enu_earth(lat_deg: float, lon_deg: float, height_m: float) -> F64:
 
 
 def lane_map_of(
-    where: Path | str, odr: OdrMap, T_local_map: F64
+    location: Path | str, odr: OdrMap, T_local_map: F64
 ) -> tuple[LaneMap, tuple[str, ...]]:
     """Return the lane map of a parsed file in the local frame, with notes on what was left out.
 
@@ -243,12 +249,12 @@ def lane_map_of(
     Raises:
         InputError: No road has a lane for vehicles.
     """
-    lanes, notes = read_lanes(where, odr, T_local_map)
+    lanes, notes = read_lanes(location, odr, T_local_map)
     return bordered(lanes, roadside(odr, lanes, T_local_map)), notes
 
 
 def read_lanes(
-    where: Path | str, odr: OdrMap, T_local_map: F64
+    location: Path | str, odr: OdrMap, T_local_map: F64
 ) -> tuple[dict[str, Lane], tuple[str, ...]]:
     """Return the linked lanes of a parsed file in the local frame, with notes on what was left out.
 
@@ -264,14 +270,14 @@ def read_lanes(
     apart = []
     changing: list[str] = []
     for road in odr.roads:
-        place = f"{where}, road {road.road_id}"
+        place = f"{location}, road {road.road_id}"
         for index, section in enumerate(road.sections):
             if not road.records or section.end_m - section.s_m <= 1e-6:
                 left_out["any, in a section without length or geometry"] += len(section.lanes)
                 continue
             with parsing(f"{place}, section {index}", "repair its numbers"):
-                found = _section(road, index, section, T_local_map, left_out, changing)
-            lanes.update({one.lane_id: one for one in found})
+                section_lanes = _section(road, index, section, T_local_map, left_out, changing)
+            lanes.update({one.lane_id: one for one in section_lanes})
         ends_m = (one.s_m + one.length_m for one in road.records)
         missing = road.length_m - max(ends_m, default=road.length_m)
         if missing > MAX_MISSING_M:
@@ -286,7 +292,7 @@ def read_lanes(
             apart.append(f"{road.road_id} ({gap:.2f} m)")
     if not any(lane.kind == "vehicle" for lane in lanes.values()):
         raise InputError(
-            f"{where}: a map without a lane for vehicles", "use a map with lanes of type driving"
+            f"{location}: a map without a lane for vehicles", "use a map with lanes of type driving"
         )
     linked, link_notes = following(odr, lanes)
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
@@ -320,13 +326,13 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
 
     def spots(name: str, s_m: float) -> list[Spot]:
         road = roads[name]
-        found = []
+        nearby_spots = []
         for _, key, inner_t, outer_t in lanes_at(road, s_m):
             if key in lanes:
                 middle = np.array([[s_m, (inner_t + outer_t) / 2]])
                 point = placed(road, middle, T_local_map)[0]
-                found.append(Spot(key, project(lanes[key].centre, point)[0]))
-        return found
+                nearby_spots.append(Spot(key, project(lanes[key].centre, point)[0]))
+        return nearby_spots
 
     return StreetMap(
         lanes,

@@ -33,7 +33,9 @@ MAX_ROAD_M = MAP_ROAD_M.high
 # Elements of a map that are read, or that change no road; types of junctions that are read.
 KNOWN = {"header", "road", "junction", "controller", "junctionGroup", "station", "userData"}
 JUNCTIONS = ("default", "direct", "")
-STOP_LINE, CROSSWALK = "294", "1000003"  # catalogue numbers of marks on the road
+# Catalogue numbers of marks on the road.
+STOP_LINE = "294"
+CROSSWALK = "1000003"
 CROSSWALK_M = 4.0
 UNITS_MPS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 JOIN_M = 0.01  # records of a reference line that lie farther apart do not join
@@ -70,8 +72,8 @@ class Geometry:
             # The heading is quadratic in s: 32 points are exact to rounding for any road's turn.
             start = self.numbers[0] if self.numbers else 0.0
             rate = (self.numbers[1] - start) / self.length_m if self.kind == "spiral" else 0.0
-            at = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
-            heading = self.heading_rad + at * (start + 0.5 * rate * at)
+            nodes_m = 0.5 * s_m[:, None] * (1.0 + _NODES)  # (N, 32)
+            heading = self.heading_rad + nodes_m * (start + 0.5 * rate * nodes_m)
             x = self.x_m + 0.5 * s_m * (np.cos(heading) @ _WEIGHTS)
             y = self.y_m + 0.5 * s_m * (np.sin(heading) @ _WEIGHTS)
             return np.column_stack([x, y, self.heading_rad + s_m * (start + 0.5 * rate * s_m)])
@@ -115,8 +117,8 @@ def gap_m(road: Road) -> float:
     and the start of the next one.
     """
     largest = 0.0
-    for one, following in itertools.pairwise(road.records):
-        end = one.at(np.array([following.s_m - one.s_m]))[0]
+    for record, following in itertools.pairwise(road.records):
+        end = record.at(np.array([following.s_m - record.s_m]))[0]
         away = float(np.hypot(end[0] - following.x_m, end[1] - following.y_m))
         largest = max(largest, away)
     return largest
@@ -178,8 +180,8 @@ class Section:
         """Return the lanes of one side (1 left, -1 right), from the middle outwards."""
         return tuple(
             sorted(
-                (one for one in self.lanes if one.lane_id * sign > 0),
-                key=lambda one: abs(one.lane_id),
+                (lane for lane in self.lanes if lane.lane_id * sign > 0),
+                key=lambda lane: abs(lane.lane_id),
             )
         )
 
@@ -264,7 +266,7 @@ class OdrMap:
     notes: tuple[str, ...] = ()
 
 
-def parse_map(where: Path | str, root: Element) -> OdrMap:
+def parse_map(location: Path | str, root: Element) -> OdrMap:
     """Parse an OpenDRIVE document.
 
     Raises:
@@ -275,32 +277,32 @@ def parse_map(where: Path | str, root: Element) -> OdrMap:
     elements = {str(road.get("id")): road for road in root.findall("road")}
     if root.tag != "OpenDRIVE" or not elements:
         raise InputError(
-            f"{where}: a document <{root.tag}> of {len(elements)} roads",
+            f"{location}: a document <{root.tag}> of {len(elements)} roads",
             "give an OpenDRIVE file, whose root is <OpenDRIVE>, with at least one road",
         )
     if len(elements) < len(root.findall("road")):
-        raise InputError(f"{where}: two roads of one id", "give every road its own id")
+        raise InputError(f"{location}: two roads of one id", "give every road its own id")
     originals = {str(signal.get("id")): signal for signal in root.iter("signal")}
     unused: Counter[str] = Counter()
     roads = []
     for road_id, element in elements.items():
-        with parsing(f"{where}, road {road_id}", "correct the numbers of this road"):
-            roads.append(_road(element, f"{where}, road {road_id}", originals, unused))
-    with parsing(where, "correct the links of its junctions"):
+        with parsing(f"{location}, road {road_id}", "correct the numbers of this road"):
+            roads.append(_road(element, f"{location}, road {road_id}", originals, unused))
+    with parsing(location, "correct the links of its junctions"):
         connections = tuple(
             Connection(
                 junction.get("id", ""),
-                one.get("incomingRoad", ""),
-                one.get("connectingRoad", one.get("linkedRoad", "")),
-                one.get("contactPoint", "start") == "start",
+                connection.get("incomingRoad", ""),
+                connection.get("connectingRoad", connection.get("linkedRoad", "")),
+                connection.get("contactPoint", "start") == "start",
                 tuple(
                     (int(link.get("from", "")), int(link.get("to", "")))
-                    for link in one.findall("laneLink")
+                    for link in connection.findall("laneLink")
                 ),
-                "linkedRoad" in one.attrib,
+                "linkedRoad" in connection.attrib,
             )
             for junction in root.findall("junction")
-            for one in junction.findall("connection")
+            for connection in junction.findall("connection")
         )
     notes = [*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root)]
     notes += [
@@ -359,41 +361,18 @@ def _odd_sides(elements: Mapping[str, Element]) -> list[str]:
 
 
 def _road(
-    element: Element, where: str, originals: Mapping[str, Element], unused: Counter[str]
+    element: Element, location: str, originals: Mapping[str, Element], unused: Counter[str]
 ) -> Road:
-    """Parse a road; what stands on it and is not used is counted in ``unused``.
-
-    Crosswalks are objects of that type, or marks of type 1000003, which have no length along the
-    road: 4 m is assumed. Stop lines are marks of type 294, or objects with such a name.
-    """
+    """Parse a road; what stands on it and is not used is counted in ``unused``."""
     road_m = _number(element, "length")
-    MAP_ROAD_M.check(road_m, where, "length")
+    MAP_ROAD_M.check(road_m, location, "length")
     rule = element.get("rule", "RHT").upper()
     if rule not in ("RHT", "LHT"):
         raise ValueError(f"rule = {rule!r}, neither RHT nor LHT")
-    signals = [_signal(one, one) for one in element.findall("signals/signal")]
-    rings = [_rectangle(one) for one in signals if one.kind == CROSSWALK]
-    for one in element.findall("objects/object"):
-        if one.get("type") == "crosswalk" and one.find(".//outline") is not None:
-            rings.append(_crosswalk(one))
-        elif "stopline" in f"{one.get('name')}{one.get('subtype')}".lower().replace(" ", ""):
-            signals.append(replace(_signal(one, one), kind=STOP_LINE))
-        else:
-            unused[f"objects of type {one.get('type')} are not used"] += 1
-    for one in element.findall("signals/signalReference"):
-        original = originals.get(str(one.get("id")))
-        if original is None:
-            unused["references to signals that the map does not have are left out"] += 1
-        else:
-            signals.append(_signal(one, original))
-    sections = sorted(element.findall("lanes/laneSection"), key=lambda one: _number(one, "s", 0.0))
-    if any(one.get("singleSide") == "true" for one in sections):
-        raise ValueError("lane sections of a single side, which are not read: write both sides")
-    starts = [_number(one, "s", 0.0) for one in sections]
-    if starts and not (starts[0] >= 0 and starts[-1] <= road_m):
-        raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
-    types = sorted(element.findall("type"), key=lambda one: _number(one, "s", 0.0))
-    records = [_geometry(one, where, road_m) for one in element.findall("planView/geometry")]
+    signals, crosswalks = _signals_and_crosswalks(element, originals, unused)
+    geometries = element.findall("planView/geometry")
+    records = [_geometry(geometry, location, road_m) for geometry in geometries]
+    types = sorted(element.findall("type"), key=_start_m)
     return Road(
         str(element.get("id")),
         road_m,
@@ -403,15 +382,63 @@ def _road(
         _cubics(element, "elevationProfile/elevation"),
         _cubics(element, "lateralProfile/superelevation"),
         _cubics(element, "lanes/laneOffset"),
-        tuple(
-            _section(one, start, end)
-            for one, start, end in zip(sections, starts, [*starts, road_m][1:], strict=True)
-        ),
+        _sections(element, road_m),
         _link(element, "successor"),
         _link(element, "predecessor"),
-        tuple(signals),
-        tuple(rings),
-        tuple((_number(one, "s", 0.0), _limit_mps(one.find("speed"))) for one in types),
+        signals,
+        crosswalks,
+        tuple((_start_m(kind), _limit_mps(kind.find("speed"))) for kind in types),
+    )
+
+
+def _start_m(element: Element) -> float:
+    return _number(element, "s", 0.0)
+
+
+def _signals_and_crosswalks(
+    element: Element, originals: Mapping[str, Element], unused: Counter[str]
+) -> tuple[tuple[RoadSignal, ...], tuple[F64, ...]]:
+    """Return the signals and stop lines of a road, and the rings ``(N, 2)`` of s and t of its
+    crosswalks.
+
+    Crosswalks are objects of that type, or marks of type 1000003, which have no length along the
+    road: 4 m is assumed. Stop lines are marks of type 294, or objects with such a name.
+    """
+    signals = [_signal(signal, signal) for signal in element.findall("signals/signal")]
+    rings = [_rectangle(signal) for signal in signals if signal.kind == CROSSWALK]
+    for road_object in element.findall("objects/object"):
+        name = f"{road_object.get('name')}{road_object.get('subtype')}".lower().replace(" ", "")
+        if road_object.get("type") == "crosswalk" and road_object.find(".//outline") is not None:
+            rings.append(_crosswalk(road_object))
+        elif "stopline" in name:
+            signals.append(replace(_signal(road_object, road_object), kind=STOP_LINE))
+        else:
+            unused[f"objects of type {road_object.get('type')} are not used"] += 1
+    for reference in element.findall("signals/signalReference"):
+        original = originals.get(str(reference.get("id")))
+        if original is None:
+            unused["references to signals that the map does not have are left out"] += 1
+        else:
+            signals.append(_signal(reference, original))
+    return tuple(signals), tuple(rings)
+
+
+def _sections(element: Element, road_m: float) -> tuple[Section, ...]:
+    """Return the lane sections of a road in the order of their starts.
+
+    Raises:
+        ValueError: A section holds one side only, or starts outside of the road.
+    """
+    sections = sorted(element.findall("lanes/laneSection"), key=_start_m)
+    if any(section.get("singleSide") == "true" for section in sections):
+        raise ValueError("lane sections of a single side, which are not read: write both sides")
+    starts = [_start_m(section) for section in sections]
+    if starts and not (starts[0] >= 0 and starts[-1] <= road_m):
+        raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
+    ends = [*starts, road_m][1:]
+    return tuple(
+        _section(section, start, end)
+        for section, start, end in zip(sections, starts, ends, strict=True)
     )
 
 
@@ -444,19 +471,19 @@ def _limit_mps(speed: Element | None) -> float | None:
     return value
 
 
-def _geometry(record: Element, where: str, road_m: float) -> Geometry:
+def _geometry(record: Element, location: str, road_m: float) -> Geometry:
     shapes = [child for child in record if child.tag in _PARAMETERS]
     if not shapes:
         raise ValueError(f"a <geometry> of none of {', '.join(_PARAMETERS)}")
     shape = shapes[0]
     numbers = tuple(_number(shape, name) for name in _PARAMETERS[shape.tag])
     s, x, y, heading, length = (_number(record, name) for name in ("s", "x", "y", "hdg", "length"))
-    MAP_ROAD_M.check(length, where, "length of a <geometry>")
+    MAP_ROAD_M.check(length, location, "length of a <geometry>")
     if not -1.0 <= s <= road_m + 1.0:
         raise ValueError(f"a <geometry> at s = {s:g} of a road of {road_m:g} m")
     if shape.tag in ("arc", "spiral"):
         for value in numbers:
-            MAP_CURVATURE_PER_M.check(value, where)
+            MAP_CURVATURE_PER_M.check(value, location)
     normalised = shape.get("pRange", "normalized") != "arcLength"
     return Geometry(s, x, y, heading, length, shape.tag, numbers, normalised)
 
@@ -464,35 +491,35 @@ def _geometry(record: Element, where: str, road_m: float) -> Geometry:
 def _section(element: Element, start_m: float, end_m: float) -> Section:
     lanes = []
     for side in ("left", "center", "right"):
-        for one in element.findall(f"{side}/lane"):
-            mark = one.find("roadMark")
+        for lane in element.findall(f"{side}/lane"):
+            mark = lane.find("roadMark")
             lanes.append(
                 OdrLane(
-                    int(one.get("id", "")),
-                    one.get("type", "none"),
-                    _cubics(one, "width", "sOffset", start_m),
-                    _cubics(one, "border", "sOffset", start_m),
-                    tuple(int(link.get("id", "")) for link in one.findall("link/successor")),
-                    tuple(int(link.get("id", "")) for link in one.findall("link/predecessor")),
+                    int(lane.get("id", "")),
+                    lane.get("type", "none"),
+                    _cubics(lane, "width", "sOffset", start_m),
+                    _cubics(lane, "border", "sOffset", start_m),
+                    tuple(int(link.get("id", "")) for link in lane.findall("link/successor")),
+                    tuple(int(link.get("id", "")) for link in lane.findall("link/predecessor")),
                     None
                     if mark is None
                     else (mark.get("type", "none"), mark.get("color", "standard")),
-                    one.get("direction") == "reversed",
-                    one.get("level") == "true",
+                    lane.get("direction") == "reversed",
+                    lane.get("level") == "true",
                     tuple(
                         (start_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
-                        for limit in one.findall("speed")
+                        for limit in lane.findall("speed")
                     ),
                 )
             )
     return Section(start_m, end_m, tuple(lanes))
 
 
-def _cubics(owner: Element, place: str, at: str = "s", start_m: float = 0.0) -> F64:
+def _cubics(owner: Element, place: str, start_key: str = "s", start_m: float = 0.0) -> F64:
     """Return the records of an element as rows s, a, b, c, d, ordered by s; see `cubics_at`."""
     rows = [
-        [start_m + _number(one, at), *(_number(one, name, 0.0) for name in _ABCD)]
-        for one in owner.findall(place)
+        [start_m + _number(record, start_key), *(_number(record, name, 0.0) for name in _ABCD)]
+        for record in owner.findall(place)
     ]
     return np.array(sorted(rows, key=lambda row: row[0]), np.float64).reshape(-1, 5)
 
@@ -502,8 +529,8 @@ def _signal(place: Element, nature: Element) -> RoadSignal:
     written.
     """
     lanes = [
-        (int(one.get("fromLane", "")), int(one.get("toLane", "")))
-        for one in place.findall("validity")
+        (int(validity.get("fromLane", "")), int(validity.get("toLane", "")))
+        for validity in place.findall("validity")
     ]
     return RoadSignal(
         nature.get("id", ""),
@@ -519,19 +546,22 @@ def _signal(place: Element, nature: Element) -> RoadSignal:
     )
 
 
-def _rectangle(one: RoadSignal) -> F64:
+def _rectangle(signal: RoadSignal) -> F64:
     """Return the ring ``(5, 2)`` of s and t of a crosswalk that is a mark across a road."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    return np.array([one.s_m, one.t_m]) + corners * [CROSSWALK_M / 2, one.width_m / 2]
+    return np.array([signal.s_m, signal.t_m]) + corners * [CROSSWALK_M / 2, signal.width_m / 2]
 
 
-def _crosswalk(one: Element) -> F64:
+def _crosswalk(crosswalk: Element) -> F64:
     """Return the ring ``(N, 2)`` of s and t of a crosswalk's outline."""
-    turn = _number(one, "hdg", 0.0)
+    turn = _number(crosswalk, "hdg", 0.0)
     turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    local = [[_number(corner, k) for k in "uv"] for corner in one.findall(".//cornerLocal")]
-    on_road = [[_number(corner, k) for k in "st"] for corner in one.findall(".//cornerRoad")]
-    placed = np.array(local).reshape(-1, 2) @ turned + [_number(one, "s"), _number(one, "t")]
+    local = [[_number(corner, k) for k in "uv"] for corner in crosswalk.findall(".//cornerLocal")]
+    on_road = [[_number(corner, k) for k in "st"] for corner in crosswalk.findall(".//cornerRoad")]
+    placed = np.array(local).reshape(-1, 2) @ turned + [
+        _number(crosswalk, "s"),
+        _number(crosswalk, "t"),
+    ]
     ring = np.concatenate([placed, np.array(on_road).reshape(-1, 2)])
     return np.concatenate([ring, ring[:1]])
 
@@ -547,13 +577,13 @@ def _number(element: Element, name: str, default: float | None = None) -> float:
 
 
 def _link(road: Element, tag: str) -> RoadLink | None:
-    found = road.find(f"link/{tag}")
-    if found is None:
+    link = road.find(f"link/{tag}")
+    if link is None:
         return None
     return RoadLink(
-        found.get("elementType", "road"),
-        str(found.get("elementId")),
-        found.get("contactPoint", "start") == "start",
+        link.get("elementType", "road"),
+        str(link.get("elementId")),
+        link.get("contactPoint", "start") == "start",
     )
 
 
@@ -580,9 +610,11 @@ def lane_borders(road: Road, section: Section, s_m: F64) -> Iterator[tuple[OdrLa
 
 def lanes_at(road: Road, s_m: float) -> Iterator[tuple[OdrLane, str, float, float]]:
     """Give each lane at an arc length with its key and the signed distances of its borders."""
-    at = np.array([min(s_m, float(np.nextafter(road.length_m, 0.0)))])
-    index = max((i for i, section in enumerate(road.sections) if section.s_m <= at[0]), default=0)
-    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], at):
+    station_m = np.array([min(s_m, float(np.nextafter(road.length_m, 0.0)))])
+    index = max(
+        (i for i, section in enumerate(road.sections) if section.s_m <= station_m[0]), default=0
+    )
+    for lane, inner_t, outer_t in lane_borders(road, road.sections[index], station_m):
         yield lane, lane_key(road, index, lane.lane_id), float(inner_t[0]), float(outer_t[0])
 
 

@@ -42,21 +42,27 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
     signs = []
     for road in _roads(odr, lanes):
         crosswalks += [placed(road, ring, T_local_map) for ring in road.crosswalks]
-        for one in road.signals:
-            if one.kind == STOP_LINE:
-                held = [_lanes_at(road, one.s_m, along, one, lanes) for along in _senses(one)]
-                stop_lines += [
-                    placed(road, _line(one.s_m, some), T_local_map) for some in held if some
+        for signal in road.signals:
+            if signal.kind == STOP_LINE:
+                held = [
+                    _lanes_at(road, signal.s_m, along, signal, lanes) for along in _senses(signal)
                 ]
-            elif one.dynamic:
-                foot = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)
-                top = foot + np.array([0.0, 0.0, max(one.above_m + one.height_m, 2.0)])
+                stop_lines += [
+                    placed(road, _line(signal.s_m, direction_lanes), T_local_map)
+                    for direction_lanes in held
+                    if direction_lanes
+                ]
+            elif signal.dynamic:
+                foot = placed(road, np.array([[signal.s_m, signal.t_m]]), T_local_map)
+                top = foot + np.array([0.0, 0.0, max(signal.above_m + signal.height_m, 2.0)])
                 poles.append(np.concatenate([foot, top]))
-            elif one.kind != CROSSWALK and one.height_m > PLATE_M:
-                heading = _heading_rad(road, one.s_m, _senses(one)[0], T_local_map)
-                x, y, z = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0].tolist()
-                pose = se2(x, y, heading, z + one.above_m + one.height_m / 2)
-                signs.append((pose, Box(0.05, one.width_m, one.height_m)))
+            elif signal.kind != CROSSWALK and signal.height_m > PLATE_M:
+                heading = _heading_rad(road, signal.s_m, _senses(signal)[0], T_local_map)
+                x, y, z = placed(road, np.array([[signal.s_m, signal.t_m]]), T_local_map)[
+                    0
+                ].tolist()
+                pose = se2(x, y, heading, z + signal.above_m + signal.height_m / 2)
+                signs.append((pose, Box(0.05, signal.width_m, signal.height_m)))
     return LaneMap(
         {},
         crosswalks=tuple(crosswalks),
@@ -78,10 +84,10 @@ def traffic_lights(
     heads = []
     loose = []
     for road in _roads(odr, lanes):
-        for one in (signal for signal in road.signals if signal.dynamic):
-            found = _heads(road, one, odr.controllers, lanes, T_local_map)
-            heads += found
-            loose += [] if found else [one.signal_id]
+        for light in (signal for signal in road.signals if signal.dynamic):
+            light_heads = _heads(road, light, odr.controllers, lanes, T_local_map)
+            heads += light_heads
+            loose += [] if light_heads else [light.signal_id]
     notes = [f"{len(loose)} traffic lights hold back no lane: {', '.join(loose)}"] if loose else []
     return tuple(heads), tuple(notes)
 
@@ -91,9 +97,9 @@ def give_way_lines(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> 
     return tuple(
         head.signal
         for road in _roads(odr, lanes)
-        for one in road.signals
-        if one.kind in GIVE_WAY
-        for head in _heads(road, one, odr.controllers, lanes, T_local_map)
+        for signal in road.signals
+        if signal.kind in GIVE_WAY
+        for head in _heads(road, signal, odr.controllers, lanes, T_local_map)
     )
 
 
@@ -104,13 +110,13 @@ def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:
 
 def _heads(
     road: Road,
-    one: RoadSignal,
+    light: RoadSignal,
     controllers: Mapping[str, str],
     lanes: Mapping[str, Lane],
     T_local_map: F64,
 ) -> list[Head]:
     heads = []
-    for along in _senses(one):
+    for along in _senses(light):
         link = road.successor if along else road.predecessor
         junction = f"on road {road.road_id}"
         stop_lines = [
@@ -118,75 +124,79 @@ def _heads(
             for line in road.signals
             if line.kind == STOP_LINE
             and along in _senses(line)
-            and abs(line.s_m - one.s_m) <= STOP_REACH_M
+            and abs(line.s_m - light.s_m) <= STOP_REACH_M
         ]
-        s_m = min(stop_lines, key=lambda stop_m: abs(stop_m - one.s_m), default=one.s_m)
+        s_m = min(stop_lines, key=lambda stop_m: abs(stop_m - light.s_m), default=light.s_m)
         if road.junction != "-1":
             junction = road.junction
             s_m = 0.0 if along else road.length_m
         elif link is not None and link.kind == "junction":
             junction = link.target
-        if one.kind == PEDESTRIAN_LIGHT:
-            signal = _for_people(road, one, lanes, T_local_map)
+        if light.kind == PEDESTRIAN_LIGHT:
+            signal = _for_people(road, light, lanes, T_local_map)
         else:
-            held = _lanes_at(road, s_m, along, one, lanes)
+            held = _lanes_at(road, s_m, along, light, lanes)
             if not held:
                 continue
             ends = placed(road, _line(s_m, held), T_local_map)
             signal = Signal(
-                ends, _heading_rad(road, s_m, along, T_local_map), (), 0, one.signal_id,
+                ends, _heading_rad(road, s_m, along, T_local_map), (), 0, light.signal_id,
                 tuple(key for key, _, _ in held),
             )  # fmt: skip
-        place = placed(road, np.array([[one.s_m, one.t_m]]), T_local_map)[0]
-        place[2] += max(one.above_m + one.height_m / 2, LOWEST_HEAD_M)
+        place = placed(road, np.array([[light.s_m, light.t_m]]), T_local_map)[0]
+        place[2] += max(light.above_m + light.height_m / 2, LOWEST_HEAD_M)
         signal = replace(signal, head=place)
-        group = controllers.get(one.signal_id, f"road {road.road_id}")
+        group = controllers.get(light.signal_id, f"road {road.road_id}")
         heads.append(Head(signal, junction, group, road.road_id))
     return heads
 
 
-def _for_people(road: Road, one: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64) -> Signal:
+def _for_people(
+    road: Road, light: RoadSignal, lanes: Mapping[str, Lane], T_local_map: F64
+) -> Signal:
     """Return the light of those who cross a road: they wait at the side of the nearest crosswalk
     that the light stands on.
     """
-    rings = [ring for ring in road.crosswalks if abs(ring[:, 0].mean() - one.s_m) <= STOP_REACH_M]
-    low_m = one.s_m - CROSSWALK_M / 2
-    high_m = one.s_m + CROSSWALK_M / 2
+    rings = [ring for ring in road.crosswalks if abs(ring[:, 0].mean() - light.s_m) <= STOP_REACH_M]
+    low_m = light.s_m - CROSSWALK_M / 2
+    high_m = light.s_m + CROSSWALK_M / 2
     if rings:
-        ring = min(rings, key=lambda ring: abs(float(ring[:, 0].mean()) - one.s_m))
+        ring = min(rings, key=lambda ring: abs(float(ring[:, 0].mean()) - light.s_m))
         low_m = float(ring[:, 0].min())
         high_m = float(ring[:, 0].max())
-    ends = placed(road, np.array([[low_m, one.t_m], [high_m, one.t_m]]), T_local_map)
-    towards = -np.pi / 2 if one.t_m > 0 else np.pi / 2
-    heading = _heading_rad(road, one.s_m, True, T_local_map) + towards
+    ends = placed(road, np.array([[low_m, light.t_m], [high_m, light.t_m]]), T_local_map)
+    towards = -np.pi / 2 if light.t_m > 0 else np.pi / 2
+    heading = _heading_rad(road, light.s_m, True, T_local_map) + towards
     crossed = [
-        key for along in (True, False) for key, _, _ in _lanes_at(road, one.s_m, along, None, lanes)
+        key
+        for along in (True, False)
+        for key, _, _ in _lanes_at(road, light.s_m, along, None, lanes)
     ]
-    return Signal(ends, heading, (), 0, one.signal_id, tuple(crossed), pedestrians=True)
+    return Signal(ends, heading, (), 0, light.signal_id, tuple(crossed), pedestrians=True)
 
 
-def _senses(one: RoadSignal) -> tuple[bool, ...]:
+def _senses(signal: RoadSignal) -> tuple[bool, ...]:
     """Return whether a signal is for traffic along its road, against it, or both."""
-    return {"+": (True,), "-": (False,)}.get(one.orientation, (True, False))
+    return {"+": (True,), "-": (False,)}.get(signal.orientation, (True, False))
 
 
 Held = tuple[str, float, float]  # a lane and the signed distances of its borders
 
 
 def _lanes_at(
-    road: Road, s_m: float, along: bool, one: RoadSignal | None, lanes: Mapping[str, Lane]
+    road: Road, s_m: float, along: bool, signal: RoadSignal | None, lanes: Mapping[str, Lane]
 ) -> list[Held]:
     """Return the lanes of one direction for vehicles, where a signal names some of them, only
     those.
     """
-    found = []
+    candidates = []
     for lane, key, inner_t, outer_t in lanes_at(road, s_m):
         made = lanes.get(key)
         for_vehicles = made is not None and made.kind in ("vehicle", "bus")
         if for_vehicles and driven_along(road, lane) == along:
-            found.append((lane.lane_id, (key, inner_t, outer_t)))
-    named = [held for lane_id, held in found if one is not None and one.holds(lane_id)]
-    return named or [held for _, held in found]
+            candidates.append((lane.lane_id, (key, inner_t, outer_t)))
+    named = [held for lane_id, held in candidates if signal is not None and signal.holds(lane_id)]
+    return named or [held for _, held in candidates]
 
 
 def _line(s_m: float, held: Sequence[Held]) -> F64:

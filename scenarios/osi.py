@@ -30,17 +30,26 @@ from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails
 from scenarios.osi_messages import OSI, UNREAD, ground_truths, met_fields
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
-VEHICLE, PEDESTRIAN = 2, 3  # types of moving objects
+# Types of moving objects.
+VEHICLE = 2
+PEDESTRIAN = 3
+# Of vehicles; all else is "other".
 LABELS = {
     **dict.fromkeys((2, 3, 4, 5, 6), "car"),
     **dict.fromkeys((7, 8, 9, 16), "truck"),
     10: "motorcycle",
     **dict.fromkeys((11, 17, 18), "cyclist"),
     12: "bus",
-}  # of vehicles; all else is "other"
-DRIVING, INTERSECTION = 2, 4  # types of lanes
-KINDS = {3: "bike", 5: "parking", 6: "shoulder", 9: "shoulder"}  # by their subtype
-SOLID, DASHED, DOTS = 3, 4, 5  # types of boundaries
+}
+# Types of lanes.
+DRIVING = 2
+INTERSECTION = 4
+# Kinds of other lanes by their subtype.
+KINDS = {3: "bike", 5: "parking", 6: "shoulder", 9: "shoulder"}
+# Types of boundaries.
+SOLID = 3
+DASHED = 4
+DOTS = 5
 YELLOW = 4
 ROAD_HEIGHT_M = 0.3  # wheels that are farther above or below the lanes are not on the road
 JOIN_STEPS = 16  # of a lane through an intersection
@@ -66,15 +75,15 @@ class _Track:
         size = self.first.base.dimension
         return Box(size.length, size.width, size.height)
 
-    def trajectory(self, where: str, origin: F64, least: int = 1) -> Trajectory:
+    def trajectory(self, location: str, origin: F64, least: int = 1) -> Trajectory:
         """Return the poses of the box centre."""
         table = np.array(self.rows)
         table[:, 3] += self.raised_m
         turns = Rotation.from_euler("ZYX", np.nan_to_num(table[:, 4:]))
         return checked_trajectory(
-            where,
+            location,
             table[:, 0].astype(np.int64),
-            near(where, table[:, 1:4] - origin),
+            near(location, table[:, 1:4] - origin),
             turns.as_quat(scalar_first=True),
             least,
         )
@@ -111,11 +120,11 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         if roads is None and message.lane:
             roads = message
         t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
-        for one in message.moving_object:
-            place = one.base.position
-            turn = one.base.orientation
+        for moving_object in message.moving_object:
+            place = moving_object.base.position
+            turn = moving_object.base.orientation
             row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
-            tracks.setdefault(one.id.value, _Track(one)).rows.append(row)
+            tracks.setdefault(moving_object.id.value, _Track(moving_object)).rows.append(row)
     if ego is None:
         ego = _usual_ego(file, tracks, count)
         why = "the first vehicle that is always there"
@@ -274,15 +283,17 @@ def _moved(lane: Lane, shift: F64) -> Lane:
 
 def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
     """Return the lanes of a message, linked."""
-    borders = {one.id.value: one for one in roads.lane_boundary}
+    borders = {border.id.value: border for border in roads.lane_boundary}
     lanes: dict[str, Lane] = {}
-    for one in roads.lane:
-        lane = _lane(f"{path}, lane {one.id.value}", one, borders, origin)
+    for road_lane in roads.lane:
+        lane = _lane(f"{path}, lane {road_lane.id.value}", road_lane, borders, origin)
         if lane is not None:
             lanes[lane.lane_id] = lane
     after = {key: list(lane.successors) for key, lane in lanes.items()}
-    for one in (one for one in roads.lane if one.classification.type == INTERSECTION):
-        for pair in one.classification.lane_pairing:
+    for road_lane in roads.lane:
+        if road_lane.classification.type != INTERSECTION:
+            continue
+        for pair in road_lane.classification.lane_pairing:
             begin = str(pair.antecessor_lane_id.value)
             end = str(pair.successor_lane_id.value)
             if begin in lanes and end in lanes and begin != end:
@@ -290,7 +301,7 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
                 sides = zip(rails(lanes[begin]), rails(lanes[end]), strict=True)
                 left, right = (_curve(*edges) for edges in sides)
                 lane = Lane(
-                    f"{one.id.value}.{begin}.{end}",
+                    f"{road_lane.id.value}.{begin}.{end}",
                     (left + right) / 2,
                     left,
                     right,
@@ -303,27 +314,27 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
                 lanes[lane.lane_id] = lane
     out = {}
     for key, lane in lanes.items():
-        found = after.get(key, list(lane.successors))
+        successors = after.get(key, list(lane.successors))
         out[key] = replace(
             lane,
-            successors=tuple(name for name in found if name in lanes),
+            successors=tuple(name for name in successors if name in lanes),
             left_neighbour=same_way(lane, lanes, lane.left_neighbour),
             right_neighbour=same_way(lane, lanes, lane.right_neighbour),
         )
     return out
 
 
-def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane | None:
+def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64) -> Lane | None:
     """Return a lane in driving direction; None for one that is not driven or lacks a border."""
-    facts = one.classification
+    facts = road_lane.classification
     kind = "vehicle" if facts.type == DRIVING else KINDS.get(facts.subtype)
     if kind is None or len(facts.centerline) < 2:
         return None
-    centre = near(where, _points(facts.centerline) - origin)
+    centre = near(location, _points(facts.centerline) - origin)
     sides = []
     for ids in (facts.left_lane_boundary_id, facts.right_lane_boundary_id):
-        found = [borders[ref.value] for ref in ids if ref.value in borders]
-        points = [_points(p.position for p in border.boundary_line) for border in found]
+        lane_borders = [borders[ref.value] for ref in ids if ref.value in borders]
+        points = [_points(p.position for p in border.boundary_line) for border in lane_borders]
         border_points = np.concatenate([np.zeros((0, 3)), *points]) - origin
         s_m = np.array([project(centre, point)[0] for point in border_points])
         order = np.argsort(s_m, kind="stable")
@@ -332,7 +343,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
         edge = line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
         if len(edge) < 2:
             return None
-        sides.append((near(where, edge), _mark_type(found[0])))
+        sides.append((near(location, edge), _mark_type(lane_borders[0])))
     ahead = [str(pair.successor_lane_id.value) for pair in facts.lane_pairing]
     behind = [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing]
     beside = [
@@ -349,7 +360,7 @@ def _lane(where: str, one: Any, borders: Mapping[int, Any], origin: F64) -> Lane
     if min(float(arc_lengths(edge)[-1]) for edge in (left, right)) <= 0.0:
         return None
     return Lane(
-        str(one.id.value),
+        str(road_lane.id.value),
         centre_line(left, right),
         left,
         right,

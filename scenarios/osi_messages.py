@@ -147,12 +147,12 @@ def ground_truths(files: SourceFiles, path: Path) -> Iterator[Truth]:
     parts = _in_mcap(data, path) if path.suffix == ".mcap" else _in_trace(data, path)
     classes = message_classes()
     for number, part in enumerate(parts):
-        where = f"{path}, message {number}"
+        location = f"{path}, message {number}"
         try:
-            yield _truth_of(part, classes, where)
+            yield _truth_of(part, classes, location)
         except DecodeError as error:
             raise InputError(
-                f"{where}: no readable OSI message", "give a binary .osi trace"
+                f"{location}: no readable OSI message", "give a binary .osi trace"
             ) from error
 
 
@@ -163,8 +163,8 @@ def _in_trace(data: bytes, path: Path) -> Iterator[bytes]:
         length = int.from_bytes(data[start : start + 4], "little")
         part = data[start + 4 : start + 4 + length]
         if len(part) < length or length == 0:
-            found = f"{path}, message {number}: {len(part)} of {length} bytes"
-            raise InputError(found, "fetch the file again; it may be truncated")
+            fault = f"{path}, message {number}: {len(part)} of {length} bytes"
+            raise InputError(fault, "fetch the file again; it may be truncated")
         yield part
         start += 4 + length
         number += 1
@@ -183,15 +183,15 @@ def _in_mcap(data: bytes, path: Path) -> list[bytes]:
     topics = sorted({(name, topic) for name, topic, _ in listed})
     read = [one for one in topics if one[0] in MCAP_SCHEMAS]
     if len(read) != 1:
-        found = ", ".join(f"{topic} ({name})" for name, topic in topics) or "no messages"
+        channels = ", ".join(f"{topic} ({name})" for name, topic in topics) or "no messages"
         raise InputError(
-            f"{path}: {len(read)} channels of a ground truth among {found}",
+            f"{path}: {len(read)} channels of a ground truth among {channels}",
             f"give a file with one channel of {' or '.join(MCAP_SCHEMAS)}",
         )
     return [part for name, topic, part in listed if (name, topic) == read[0]]
 
 
-def _truth_of(part: bytes, classes: Mapping[str, Any], where: str) -> Truth:
+def _truth_of(part: bytes, classes: Mapping[str, Any], location: str) -> Truth:
     """Return the ground truth in a message, by the fields that its kind alone has.
 
     Raises:
@@ -199,16 +199,16 @@ def _truth_of(part: bytes, classes: Mapping[str, Any], where: str) -> Truth:
     """
     message = classes["GroundTruth"].FromString(part)
     # In other kinds the same number holds parts of other types.
-    if any(one.base.HasField("position") for one in message.moving_object):
+    if any(entry.base.HasField("position") for entry in message.moving_object):
         return Truth(message, _host_of(message))
     update = classes["TrafficUpdate"].FromString(part)
-    if any(one.base.HasField("position") for one in update.update):
-        raise _without_truth(where, "TrafficUpdate")
+    if any(entry.base.HasField("position") for entry in update.update):
+        raise _without_truth(location, "TrafficUpdate")
     detected = classes["SensorData"].FromString(part)
-    if any(one.base.HasField("position") for one in detected.moving_object) or any(
-        one.HasField("global_ground_truth") for one in detected.sensor_view
+    if any(entry.base.HasField("position") for entry in detected.moving_object) or any(
+        entry.HasField("global_ground_truth") for entry in detected.sensor_view
     ):
-        raise _without_truth(where, "SensorData")
+        raise _without_truth(location, "SensorData")
     view = classes["SensorView"].FromString(part)
     if not view.HasField("global_ground_truth"):
         return Truth(message, _host_of(message))
@@ -238,9 +238,9 @@ def _host_of(message: Any) -> int | None:
     return int(message.host_vehicle_id.value) if message.HasField("host_vehicle_id") else None
 
 
-def _without_truth(where: str, kind: str) -> InputError:
+def _without_truth(location: str, kind: str) -> InputError:
     return InputError(
-        f"{where}: a {kind} message, which holds no ground truth",
+        f"{location}: a {kind} message, which holds no ground truth",
         f"record a trace of {' or '.join(TRUTH_KINDS)}",
     )
 

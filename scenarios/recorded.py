@@ -40,23 +40,24 @@ from alpasim_plugin.core.types import (
 MAX_REACH_M = COORDINATE_M.high
 
 MAX_GAP_US = 500_000  # a track is not interpolated across a longer hole: it becomes two actors
+# Largest distance from the median position.
 STATIC_REACH_M = {
     "pedestrian": 0.5,
     "cyclist": 0.5,
     "motorcycle": 0.75,
-}  # largest distance from the median position
+}
 STATIC_REACH_DEFAULT_M = 1.0  # annotated boxes of far parked cars drift by up to 0.8 m in 15 s
 STATIC_SPEED_MPS = 0.3
 
 
-def near(where: Path | str, xyz: F64) -> F64:
+def near(location: Path | str, xyz: F64) -> F64:
     """Return local points ``(..., 3)`` after checking that they are finite and within `MAX_REACH_M`
     of the origin.
     """
     distance = float(np.abs(xyz).max(initial=0.0))  # NaN stays NaN
     if not distance <= MAX_REACH_M:
-        found = f"a point {distance / 1000:.1f} km from the drive"
-        raise InputError(f"{where}: {found}", "repair the coordinates of this file")
+        fault = f"a point {distance / 1000:.1f} km from the drive"
+        raise InputError(f"{location}: {fault}", "repair the coordinates of this file")
     return xyz
 
 
@@ -71,7 +72,7 @@ class SourceFiles:
         """Return the sha256 over names and bytes of all files read so far, in reading order."""
         return self._hash.hexdigest()
 
-    def only(self, folder: Path, patterns: tuple[str, ...], what: str) -> Path:
+    def only(self, folder: Path, patterns: tuple[str, ...], description: str) -> Path:
         """Return the one file of a folder that matches one of the glob patterns, the first pattern
         with a match deciding.
 
@@ -79,18 +80,22 @@ class SourceFiles:
             InputError: There is none, or more than one.
         """
         if not os.path.isdir(folder):
-            raise InputError(f"{folder}: no such folder", f"give the folder that holds {what}")
+            raise InputError(
+                f"{folder}: no such folder", f"give the folder that holds {description}"
+            )
         for pattern in patterns:
-            found = sorted(folder.glob(pattern))
-            if len(found) == 1:
-                return found[0]
-            if found:
-                names = ", ".join(f.name for f in found[:3])
+            matches = sorted(folder.glob(pattern))
+            if len(matches) == 1:
+                return matches[0]
+            if matches:
+                names = ", ".join(f.name for f in matches[:3])
                 raise InputError(
-                    f"{folder}: {len(found)} files match {pattern}: {names}",
-                    f"keep exactly one file with {what}",
+                    f"{folder}: {len(matches)} files match {pattern}: {names}",
+                    f"keep exactly one file with {description}",
                 )
-        raise InputError(f"{folder}: no file {' or '.join(patterns)}", f"add the file with {what}")
+        raise InputError(
+            f"{folder}: no file {' or '.join(patterns)}", f"add the file with {description}"
+        )
 
     def read_bytes(self, path: Path) -> bytes:
         """Read a whole file.
@@ -195,8 +200,8 @@ def checked_trajectory(
             quaternions far from unit length.
     """
     if len(t_us) < least:
-        found = f"{len(t_us)} pose" + ("" if len(t_us) == 1 else "s")
-        raise InputError(f"{path}: {found}", f"use a recording with at least {least} poses")
+        fault = f"{len(t_us)} pose" + ("" if len(t_us) == 1 else "s")
+        raise InputError(f"{path}: {fault}", f"use a recording with at least {least} poses")
     norms = np.linalg.norm(quat, axis=1)
     checks = {
         "a position that is not finite": ~np.isfinite(xyz).all(axis=1),
@@ -204,10 +209,10 @@ def checked_trajectory(
         "a time that is not after the one before it": np.diff(t_us, prepend=t_us[:1] - 1) <= 0,
         "a quaternion that is not of unit length": np.abs(norms - 1.0) > 1e-2,
     }
-    for found, bad in checks.items():
+    for fault, bad in checks.items():
         if bad.any():
             row = int(np.argmax(bad))
-            raise InputError(f"{path}: {found} in row {row}", "repair or drop these rows")
+            raise InputError(f"{path}: {fault} in row {row}", "repair or drop these rows")
     return Trajectory(
         np.ascontiguousarray(t_us, np.int64), np.ascontiguousarray(xyz), quat / norms[:, None]
     )

@@ -271,9 +271,9 @@ class DegradationSpec(Part):
         for name in sorted(self.model_fields_set - {"kind"}):
             kinds = [kind for kind, names in DEGRADATION_KEYS.items() if name in names]
             if self.kind not in kinds:
-                found = f"{name} = {getattr(self, name)} with kind: {self.kind}"
+                setting = f"{name} = {getattr(self, name)} with kind: {self.kind}"
                 raise ValueError(
-                    f"{found}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}"
+                    f"{setting}, to which it means nothing | say kind: {' or '.join(kinds)}, or remove {name}"
                 )
         return self
 
@@ -398,7 +398,7 @@ class ScenarioSpec(Part):
 
     @model_validator(mode="after")
     def _one_source(self) -> ScenarioSpec:
-        if sum(given is not None for given in (self.road, self.log, self.map)) != 1:
+        if sum(source is not None for source in (self.road, self.log, self.map)) != 1:
             raise ValueError(
                 "give exactly one of 'road', 'log' and 'map' | add road: {segments: [...]}, log: {commonroad: FILE} or map: {opendrive: FILE}"
             )
@@ -416,10 +416,10 @@ class ScenarioSpec(Part):
                 ),
             }
             fields = type(self).model_fields
-            given = [key for key, value in built.items() if value != fields[key].default]
-            if given:
+            keys = [key for key, value in built.items() if value != fields[key].default]
+            if keys:
                 raise ValueError(
-                    f"{given[0]} with log.drive, whose look is its reconstruction's | remove {given[0]}"
+                    f"{keys[0]} with log.drive, whose look is its reconstruction's | remove {keys[0]}"
                 )
         return self
 

@@ -187,10 +187,10 @@ class LogSpec(Part):
 
     @model_validator(mode="after")
     def _one(self) -> LogSpec:
-        given = [key for key in (*SHIPPED, "source") if getattr(self, key) is not None]
-        if len(given) != 1:
+        sources = [key for key in (*SHIPPED, "source") if getattr(self, key) is not None]
+        if len(sources) != 1:
             raise ValueError(
-                f"{len(given)} sources ({', '.join(given) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path"
+                f"{len(sources)} sources ({', '.join(sources) or 'none'}) | give one of {', '.join(SHIPPED)}, or source and path"
             )
         if (self.source is None) != (self.path is None):
             raise ValueError(

@@ -15,7 +15,7 @@ from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
-from scenarios.variation import Drawn
+from scenarios.variation import SceneDraft
 
 SCENARIO_FILE = "scenario.yaml"  # of an imported drive
 MODELS = (".ply", ".splat", ".spz", ".sog")
@@ -154,13 +154,13 @@ def detect(path: Path) -> str:
     name = source_of(path)
     if name is not None:
         return name
-    what = contents(path)
+    description = contents(path)
     advice = import_advice(path)
     if advice is not None:
-        raise InputError(f"{path}: {what}, which is no scenario yet", advice)
+        raise InputError(f"{path}: {description}, which is no scenario yet", advice)
     formats = ", ".join(_source(name)[1].help or name for name in names("source"))
     raise InputError(
-        f"{path}: {what} that no reader recognises",
+        f"{path}: {description} that no reader recognises",
         f"give a scenario .yaml, a map (OpenDRIVE .xodr, Lanelet2 .osm), or one of: {formats}; a reader of your own is named with --source (docs/extending.md)",
     )
 
@@ -178,19 +178,19 @@ def import_advice(path: Path) -> str | None:
     return None
 
 
-def recorded_drive(drawn: Drawn, named: str | None = None) -> RecordedLog:
+def recorded_drive(draft: SceneDraft, named: str | None = None) -> RecordedLog:
     """Read the recorded log that a specification names, and check what the reader returns.
 
     Args:
-        drawn: The specification.
+        draft: The specification.
         named: A reader that need not be installed, since the user has named it.
 
     Raises:
         InputError: Nothing is there, anything is wrong with the log, or the reader gives something
             else than a `RecordedLog`.
     """
-    document = drawn.document
-    log = drawn.spec.log
+    document = draft.document
+    log = draft.spec.log
     assert log is not None
     kind, text, key = log.recorded
     path = document.folder_of(("log", key)) / text if document.marks else Path(text)

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from alpasim_plugin.core.types import Lane, LaneMap, Signal
 from scenarios.map_route import Spot
 
-GREEN_S, YELLOW_S, CLEAR_S = 6.0, 3.0, 2.0  # of each group; all are red between two groups
+GREEN_S = 6.0  # of each group
+YELLOW_S = 3.0  # of each group
+CLEAR_S = 2.0  # all are red between two groups
 WALK_END_S = 5.0  # people have red so long before the traffic may drive
 TURN_S = GREEN_S + YELLOW_S + CLEAR_S
 CYCLE = (
@@ -64,16 +66,16 @@ def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Si
     groups: dict[str, list[str]] = {}
     of_road: dict[str, str] = {}
     for head in heads:
-        known = groups.setdefault(head.junction, [])
+        junction_groups = groups.setdefault(head.junction, [])
         if not head.signal.pedestrians:
-            known.append(head.group)
+            junction_groups.append(head.group)
             of_road[head.road_id] = head.group
     out = []
     for head in heads:
-        known = sorted(set(groups[head.junction]), key=lambda name: (len(name), name))
+        junction_groups = sorted(set(groups[head.junction]), key=lambda name: (len(name), name))
         group = of_road.get(head.road_id, head.group)
-        turn = known.index(group) if group in known else 0
-        cycle_s = TURN_S * max(len(known), 2)
+        turn = junction_groups.index(group) if group in junction_groups else 0
+        cycle_s = TURN_S * max(len(junction_groups), 2)
         if head.signal.pedestrians:
             walk_s = cycle_s - TURN_S - WALK_END_S
             phases = [("green", walk_s), ("red", cycle_s - walk_s)]

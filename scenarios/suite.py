@@ -47,10 +47,10 @@ def shipped() -> dict[str, str]:
     # The plain loader of libyaml: positions of keys, which messages about other people's files
     # need, take most of a listing's time.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    found = {**shipped_names(), **suites()}
+    files = {**shipped_names(), **suites()}
     return {
         name: str(yaml.load(read_text(file), loader).get("description", ""))
-        for name, file in found.items()
+        for name, file in files.items()
     }
 
 
@@ -77,8 +77,8 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
     try:
         Path(text).stat()
     except PermissionError as error:  # it may be there
-        found = f"{error.strerror}: a folder on the way to it may not be searched"
-        return InputError(f"{text}: {found}", "let this user search and read it")
+        fault = f"{error.strerror}: a folder on the way to it may not be searched"
+        return InputError(f"{text}: {fault}", "let this user search and read it")
     except (OSError, ValueError):
         pass
     for part in ("renderer", "fixer", "policy"):
@@ -95,9 +95,9 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
         or difflib.get_close_matches(text, files, cutoff=0.8)
     )
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    found = f"no such file or folder, and no shipped {kind} has that name"
+    fault = f"no such file or folder, and no shipped {kind} has that name"
     return InputError(
-        f"{text}: {found}", f"{hint}give a path, or a name that 'simrun list scenarios' shows"
+        f"{text}: {fault}", f"{hint}give a path, or a name that 'simrun list scenarios' shows"
     )
 
 

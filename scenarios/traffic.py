@@ -33,7 +33,7 @@ from scenarios.schema_parts import (
     OncomingActor,
     ParkedActor,
 )
-from scenarios.variation import Drawn
+from scenarios.variation import SceneDraft
 
 SIZES = {
     "car": Box(4.6, 1.85, 1.55),
@@ -47,7 +47,7 @@ SIZES = {
 
 
 def place_actors(
-    drawn: Drawn, road: Road, ego_path: EgoPath, vehicle: Vehicle, end_us: int
+    draft: SceneDraft, road: Road, ego_path: EgoPath, vehicle: Vehicle, end_us: int
 ) -> tuple[list[Actor], list[Follower]]:
     """Place every actor; those who are timed against the ego come last, after a drive without them.
 
@@ -58,13 +58,13 @@ def place_actors(
         InputError: An actor outside its lane or in a lane that does not exist, with the position of
             its key.
     """
-    ego = drawn.spec.ego
-    placer = _Placer(drawn.spec, road, ego_path, vehicle, grid(end_us))
+    ego = draft.spec.ego
+    placer = _Placer(draft.spec, road, ego_path, vehicle, grid(end_us))
     scripted = _gap_cars(placer)
     followers = []
     late = []
-    for i, actor in enumerate(drawn.spec.actors):
-        with drawn.at("actors", i):
+    for i, actor in enumerate(draft.spec.actors):
+        with draft.at("actors", i):
             if isinstance(actor, CrossingActor):
                 late.append((i, actor))
             elif isinstance(actor, IdmActor):
@@ -94,7 +94,7 @@ def place_actors(
     if late:
         ego_log, _ = drive(ego_path.path, ego.start_m, vehicle, ego, scripted, followers, end_us)
         for i, crossing in late:
-            with drawn.at("actors", i):
+            with draft.at("actors", i):
                 scripted.append(_crossing(placer, crossing, ego_log))
     return scripted, followers
 
@@ -113,14 +113,14 @@ class _Placer:
         """
         start_m = self.spec.ego.start_m
         ego_line = self.ego_path.path
-        at = start_m + s_m
-        chain = lane_chain(self.road, self.ego_path, lane, at)
+        station_m = start_m + s_m
+        chain = lane_chain(self.road, self.ego_path, lane, station_m)
         path = polyline_path(polyline(self.road.lane_map, chain))
         s = s_m
         if not isinstance(lane, str):
-            xyz, _ = ego_line.at(at)
+            xyz, _ = ego_line.at(station_m)
             s = float(path.project(xyz[None, :2])[0][0])
-            if not 0 <= at <= ego_line.length_m:
+            if not 0 <= station_m <= ego_line.length_m:
                 s = -1.0
         if not 0 <= s <= path.length_m:
             raise InputError(
@@ -207,20 +207,20 @@ def _walking(actor: CrossingActor | LoggedActor) -> Behaviour:
 def _parked(placer: _Placer, actor: ParkedActor, box: Box) -> list[Actor]:
     out = []
     for n in range(actor.count):
-        at = placer.spec.ego.start_m + actor.s_m + n * actor.spacing_m
-        if not 0 <= at <= placer.ego_path.path.length_m:
+        station_m = placer.spec.ego.start_m + actor.s_m + n * actor.spacing_m
+        if not 0 <= station_m <= placer.ego_path.path.length_m:
             raise InputError(
-                f"{actor.id}: vehicle {n + 1} of {actor.count} at {at:.0f} m is beyond the road",
+                f"{actor.id}: vehicle {n + 1} of {actor.count} at {station_m:.0f} m is beyond the road",
                 "move it",
             )
         name = actor.id if actor.count == 1 else f"{actor.id}-{n}"
         # Put a vehicle beside the outer lane of one side; the clearance counts from the lane's edge
         # to the nearest side of the body.
         yaw_rad = np.deg2rad(actor.yaw_deg)
-        d, turned = _outer_edge(placer.road, placer.ego_path, at, actor.side)
+        d, turned = _outer_edge(placer.road, placer.ego_path, station_m, actor.side)
         reach = 0.5 * (abs(np.cos(yaw_rad)) * box.width_m + abs(np.sin(yaw_rad)) * box.length_m)
         sign = 1.0 if actor.side == "left" else -1.0
-        xyz, yaw = placer.ego_path.path.at(at, d + sign * (actor.clearance_m + reach))
+        xyz, yaw = placer.ego_path.path.at(station_m, d + sign * (actor.clearance_m + reach))
         heading = float(yaw) + (np.pi if turned else 0.0) + yaw_rad
         track = standing_track(xyz, heading, placer.t_us, box)
         out.append(Actor(name, actor.label, box, track, is_static=True))
@@ -245,11 +245,11 @@ def _outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tupl
     s = np.sin(float(yaw))
     along = np.array([c, s])
     normal = np.array([-s, c])
-    rest = edge[:, :2] - xyz[:2]
+    offsets = edge[:, :2] - xyz[:2]
     # The edge's vertex most nearly abreast; edges are sampled every metre and nearly parallel to
     # the line.
-    k = int(np.argmin(np.abs(rest @ along) + 0.1 * np.abs(rest @ normal)))
-    return float(rest[k] @ normal), turned
+    k = int(np.argmin(np.abs(offsets @ along) + 0.1 * np.abs(offsets @ normal)))
+    return float(offsets[k] @ normal), turned
 
 
 def _gap_cars(placer: _Placer) -> list[Actor]:
@@ -264,9 +264,11 @@ def _gap_cars(placer: _Placer) -> list[Actor]:
         for side, count in (("left", segment.cars_left), ("right", segment.cars_right)):
             sign = 1.0 if side == "left" else -1.0
             for n in range(count):
-                at = begin + (end - begin) * (0.25 + 0.5 * (n + 0.5) / count)
+                station_m = begin + (end - begin) * (0.25 + 0.5 * (n + 0.5) / count)
                 box = SIZES["car"]
-                xyz, yaw = placer.ego_path.path.at(at, sign * (segment.gap_m / 2 + box.width_m / 2))
+                xyz, yaw = placer.ego_path.path.at(
+                    station_m, sign * (segment.gap_m / 2 + box.width_m / 2)
+                )
                 heading = float(yaw) + (np.pi if side == "left" else 0.0)
                 track = standing_track(xyz, heading, placer.t_us, box)
                 out.append(Actor(f"gap{i}-{side}-{n}", "car", box, track, is_static=True))
@@ -277,43 +279,47 @@ def _crossing(placer: _Placer, actor: CrossingActor, ego_log: Trajectory) -> Act
     """Time a crossing: the walker reaches the middle of the ego's line ``before_ego_s`` before the
     undisturbed ego's front does.
     """
-    at = placer.spec.ego.start_m + actor.s_m
+    station_m = placer.spec.ego.start_m + actor.s_m
     box = box_of(actor)
     front_m = placer.vehicle.rear_axle_to_centre_m + placer.vehicle.box.length_m / 2
     s_log, _ = placer.ego_path.path.project(ego_log.xyz[:, :2])
-    if not s_log[0] + front_m < at < s_log[-1] + front_m:
+    if not s_log[0] + front_m < station_m < s_log[-1] + front_m:
         first_m, last_m = (s + front_m - placer.spec.ego.start_m for s in (s_log[0], s_log[-1]))
         raise InputError(
             f"{actor.id}: the ego's front drives from {first_m:.0f} to {last_m:.0f} m, the crossing is at s_m = {actor.s_m:.0f}",
             "choose s_m inside",
         )
-    arrival_us = float(np.interp(at - front_m, s_log, ego_log.t_us))
-    right, left = _road_edges(placer.road, placer.ego_path.path, at)
+    arrival_us = float(np.interp(station_m - front_m, s_log, ego_log.t_us))
+    right, left = _road_edges(placer.road, placer.ego_path.path, station_m)
     ends = {"right": right - actor.margin_m, "left": left + actor.margin_m}
-    start, _ = placer.ego_path.path.at(at, ends[actor.side])
-    goal, _ = placer.ego_path.path.at(at, ends["left" if actor.side == "right" else "right"])
+    start, _ = placer.ego_path.path.at(station_m, ends[actor.side])
+    goal, _ = placer.ego_path.path.at(station_m, ends["left" if actor.side == "right" else "right"])
     walk_us = round(abs(ends[actor.side]) / actor.speed_mps * 1e6)
     begin_us = round(arrival_us - actor.before_ego_s * 1e6) - walk_us
     track = walk_track(start, goal, placer.t_us, begin_us, actor.speed_mps, box)
     return Actor(actor.id, actor.label, box, track, behaviour=_walking(actor))
 
 
-def _road_edges(road: Road, path: Path, at: float) -> tuple[float, float]:
+def _road_edges(road: Road, path: Path, station_m: float) -> tuple[float, float]:
     """Return the signed distances from the ego's line to the nearest road edges on its right and its
     left, looking square to the line.
     """
-    xyz, yaw = path.at(at)
+    xyz, yaw = path.at(station_m)
     c = np.cos(float(yaw))
     s = np.sin(float(yaw))
-    found = []
+    distances = []
     for edge in road.lane_map.road_edges:
         x: F64 = (edge[:, 0] - xyz[0]) * c + (edge[:, 1] - xyz[1]) * s
         y: F64 = (edge[:, 1] - xyz[1]) * c - (edge[:, 0] - xyz[0]) * s
         cross = np.flatnonzero((x[:-1] <= 0) != (x[1:] <= 0))
-        found.append(y[cross] - x[cross] * (y[cross + 1] - y[cross]) / (x[cross + 1] - x[cross]))
-    away_m = np.concatenate(found)
+        distances.append(
+            y[cross] - x[cross] * (y[cross + 1] - y[cross]) / (x[cross + 1] - x[cross])
+        )
+    away_m = np.concatenate(distances)
     right = away_m[away_m < 0]
     left = away_m[away_m > 0]
     if not len(right) or not len(left):
-        raise InputError(f"{at:.0f} m: no road edge on one side", "choose a place on the road")
+        raise InputError(
+            f"{station_m:.0f} m: no road edge on one side", "choose a place on the road"
+        )
     return float(right.max()), float(left.min())

@@ -97,11 +97,11 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
     files = SourceFiles()
     with Archive(files, path) as archive:
         scene_id = _scene_id(archive)
-        where = f"{path}, {RIG_MEMBER}"
+        location = f"{path}, {RIG_MEMBER}"
         rig = archive.json(RIG_MEMBER)
-        with parsing(where, "give exactly one rig trajectory, as AlpaSim writes it"):
+        with parsing(location, "give exactly one rig trajectory, as AlpaSim writes it"):
             (trajectory,) = rig["rig_trajectories"]
-            ego_log = _ego_log(trajectory, where)
+            ego_log = _ego_log(trajectory, location)
             vehicle, vehicle_notes = _vehicle(trajectory)
             first_frame_us = _first_frame_us(rig)
         road = _road(archive, rig)
@@ -173,27 +173,27 @@ def _road(archive: Archive, rig: JsonObject) -> RoadMap:
         return RoadMap(tables, None, notes)
     if "map.xodr" not in archive:
         return RoadMap(LaneMap({}), None, (*notes, "no map: neither tables nor map.xodr"))
-    where = f"{archive.path}, map.xodr"
-    odr = parse_map(where, parse_xml(archive.read("map.xodr"), where))
+    location = f"{archive.path}, map.xodr"
+    odr = parse_map(location, parse_xml(archive.read("map.xodr"), location))
     with parsing(f"{archive.path}, {RIG_MEMBER}", "give T_world_base, 4 x 4"):
         T_earth_local = np.array(rig["T_world_base"], np.float64).reshape(4, 4)
         place = T_local_map(odr.geo_reference, T_earth_local)
-    lane_map, more = lane_map_of(where, odr, place)
+    lane_map, more = lane_map_of(location, odr, place)
     return RoadMap(lane_map, alpasim_map(odr, place), (*notes, *more))
 
 
-def _ego_log(rig: JsonObject, where: str) -> Trajectory:
+def _ego_log(rig: JsonObject, location: str) -> Trajectory:
     """Return the recorded drive."""
     t_us = np.array(rig["T_rig_world_timestamps_us"], np.int64)
     poses = np.array(rig["T_rig_worlds"], np.float64).reshape(len(t_us), 4, 4)
     turned = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0)
     if not turned.max(initial=0.0) < 1e-3:
         raise InputError(
-            f"{where}: pose {int(np.argmax(turned))} is not a rigid motion",
+            f"{location}: pose {int(np.argmax(turned))} is not a rigid motion",
             "give rotation matrices",
         )
     quat = quat_from_matrix(poses[:, :3, :3])
-    return checked_trajectory(where, t_us, poses[:, :3, 3].copy(), quat, least=2)
+    return checked_trajectory(location, t_us, poses[:, :3, 3].copy(), quat, least=2)
 
 
 def _first_frame_us(rig: JsonObject) -> int | None:
@@ -230,10 +230,10 @@ def _vehicle(rig: JsonObject) -> tuple[Vehicle, tuple[str, ...]]:
 
 def _actors(archive: Archive) -> tuple[Actor, ...]:
     """Return the tracks as actors."""
-    where = f"{archive.path}, sequence_tracks.json"
+    location = f"{archive.path}, sequence_tracks.json"
     document = archive.json("sequence_tracks.json")
     actors: dict[str, Actor] = {}
-    with parsing(where, "give one sequence, with lists of equal length, 7 numbers a pose"):
+    with parsing(location, "give one sequence, with lists of equal length, 7 numbers a pose"):
         (sequence,) = document.values()
         tracks = sequence["tracks_data"]
         columns = [
@@ -243,12 +243,12 @@ def _actors(archive: Archive) -> tuple[Actor, ...]:
         sizes = sequence["cuboidtracks_data"]["cuboids_dims"]
         for name, label, flags, times, poses, size in zip(*columns, sizes, strict=True):
             if str(name) in actors:
-                raise InputError(f"{where}: track {name!r} twice", "give each track its own id")
+                raise InputError(f"{location}: track {name!r} twice", "give each track its own id")
             table = np.array(poses, np.float64).reshape(len(times), 7)
             t_us = np.array(times, np.int64)
             xyz = table[:, :3].copy()
             quat = table[:, [6, 3, 4, 5]].copy()
-            track = checked_trajectory(f"{where}, track {name}", t_us, xyz, quat)
+            track = checked_trajectory(f"{location}, track {name}", t_us, xyz, quat)
             box = Box(*map(float, size))
             still = "CONTROLLABLE" not in flags
             actor = Actor(str(name), label_of(str(label)), box, track, is_static=still)
@@ -320,10 +320,14 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
         for lane_id in sorted((i for i in by_id if i * sign > 0), key=abs):
             widths = np.concatenate(by_id[lane_id])
             width = cubics_at(widths[np.argsort(widths[:, 0], kind="stable")], s)
-            at = np.column_stack([inner, line[:, 2]])
+            inner_xyz = np.column_stack([inner, line[:, 2]])
             rows = [
                 np.column_stack([xy, z])
-                for xy in (beside(at, sign * width / 2), inner, beside(at, sign * width))
+                for xy in (
+                    beside(inner_xyz, sign * width / 2),
+                    inner,
+                    beside(inner_xyz, sign * width),
+                )
             ]
             centre, left, right = (row[::-1] for row in rows) if sign > 0 else rows
             if kinds[lane_id] != "sidewalk":

@@ -60,23 +60,23 @@ class Archive:
             InputError: It is missing, encrypted, damaged, or larger than the limit, whatever size
                 the archive states.
         """
-        where = f"{self.path}, {member}"
+        location = f"{self.path}, {member}"
         info = self._infos.get(member)
         if info is None:
-            raise InputError(f"{where}: no such member", "give a complete AlpaSim scene")
+            raise InputError(f"{location}: no such member", "give a complete AlpaSim scene")
         most = int(SOURCE_BYTES.high)
         if info.file_size > most:
             raise InputError(
-                f"{where}: {info.file_size} bytes", f"give a member below {most} bytes"
+                f"{location}: {info.file_size} bytes", f"give a member below {most} bytes"
             )
         do = "fetch the file again; it may be damaged"
         with (
-            parsing(where, do, "it cannot be read"),
+            parsing(location, do, "it cannot be read"),
             self._zip.open(info) as stream,
         ):
             data = stream.read(most + 1)
         if len(data) > most:
-            raise InputError(f"{where}: more than {most} bytes", "do not use this file")
+            raise InputError(f"{location}: more than {most} bytes", "do not use this file")
         self.files.note_bytes(member, data)
         return data
 
@@ -88,14 +88,14 @@ class Archive:
         """Read a YAML member; only plain data is built, within the bounds of a configuration
         file.
         """
-        where = f"{self.path}, {member}"
+        location = f"{self.path}, {member}"
         data = self.read(member)
-        YAML_BYTES.check(len(data), where)
-        with parsing(where, "fetch the file again", "broken YAML"):
-            return parse(data.decode("utf-8"), where).data
+        YAML_BYTES.check(len(data), location)
+        with parsing(location, "fetch the file again", "broken YAML"):
+            return parse(data.decode("utf-8"), location).data
 
     def table(self, member: str) -> list[JsonObject]:
         """Read a parquet member as rows."""
-        where = f"{self.path}, {member}"
-        with parsing(where, "fetch the file again", "no readable parquet"):
-            return parse_parquet(self.read(member), where).to_pylist()
+        location = f"{self.path}, {member}"
+        with parsing(location, "fetch the file again", "no readable parquet"):
+            return parse_parquet(self.read(member), location).to_pylist()

@@ -91,22 +91,22 @@ def _rows(archive: Archive, folder: str, table: str) -> list[Row]:
 
 def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
     links: dict[tuple[str, str], tuple[str, ...]] = {}  # of several rows the first counts
-    for key, own in _rows(archive, folder, "association"):
-        objects = tuple(str(one) for one in own.get("objects") or ())
-        links.setdefault((str(key.get("kind")), str(own.get("subjects"))), objects)
+    for key, row in _rows(archive, folder, "association"):
+        objects = tuple(str(one) for one in row.get("objects") or ())
+        links.setdefault((str(key.get("kind")), str(row.get("subjects"))), objects)
     rails_of: dict[str, tuple[F64, F64]] = {}
-    for key, own in rows:
+    for key, row in rows:
         lane_id = str(key["map_id"])
         do_this = "give every lane two rails with the same number of points, at least two"
         with parsing(f"{archive.path}, {folder}, lane {lane_id}", do_this):
-            left = points(own["left_rail"])
-            right = points(own["right_rail"])
+            left = points(row["left_rail"])
+            right = points(row["right_rail"])
             if len(left) != len(right) or len(left) < 2:
                 raise ValueError(f"rails of {len(left)} and {len(right)} points")
         rails_of[lane_id] = left, right
     lanes = {}
     for lane_id, (left, right) in rails_of.items():
-        found = {
+        neighbours = {
             kind: [key for key in links.get((kind, lane_id), ()) if key in rails_of]
             for kind in ("NEXT_LANE", "LEFT_LANE", "RIGHT_LANE")
         }
@@ -115,22 +115,22 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
             with_vertices((left + right) / 2),
             with_vertices(left),
             with_vertices(right),
-            successors=tuple(found["NEXT_LANE"]),
-            left_neighbour=next(iter(found["LEFT_LANE"]), None),
-            right_neighbour=next(iter(found["RIGHT_LANE"]), None),
+            successors=tuple(neighbours["NEXT_LANE"]),
+            left_neighbour=next(iter(neighbours["LEFT_LANE"]), None),
+            right_neighbour=next(iter(neighbours["RIGHT_LANE"]), None),
         )
     edges: dict[str, F64] = {}
-    for key, own in _rows(archive, folder, "road_boundary"):
-        edges.setdefault(str(key.get("map_id")), points(own.get("location") or []))
+    for key, row in _rows(archive, folder, "road_boundary"):
+        edges.setdefault(str(key.get("map_id")), points(row.get("location") or []))
     stop_lines = [
-        points(own.get("location") or [])
-        for _, own in _rows(archive, folder, "wait_line")
-        if own.get("is_implicit") is not True
+        points(row.get("location") or [])
+        for _, row in _rows(archive, folder, "wait_line")
+        if row.get("is_implicit") is not True
     ]
     signs = []
-    for key, own in _rows(archive, folder, "traffic_sign"):
-        if key.get("map_id") is not None and own.get("center"):
-            signs.append((shifted(*points([own["center"]])[0]), SIGN))
+    for key, row in _rows(archive, folder, "traffic_sign"):
+        if key.get("map_id") is not None and row.get("center"):
+            signs.append((shifted(*points([row["center"]])[0]), SIGN))
     return LaneMap(
         lanes,
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
@@ -184,10 +184,10 @@ def map_tables(lane_map: LaneMap, clip_id: str) -> dict[str, bytes]:
     }
 
 
-def _row(map_id: str | None, label: str, own: JsonView, kind: str | None = None) -> JsonObject:
+def _row(map_id: str | None, label: str, content: JsonView, kind: str | None = None) -> JsonObject:
     return {
         "key": {"label_class_id": label, "map_id": map_id, "map_id_version": "0", "kind": kind},
-        label: dict(own),
+        label: dict(content),
         "version": 1,
     }
 
@@ -200,17 +200,17 @@ def _links(lanes: Mapping[str, Lane], ids: Mapping[str, str]) -> list[JsonObject
     out: list[JsonObject] = []
 
     def add(kind: str, subject: str, objects: list[str]) -> None:
-        own = {"subjects": subject, "objects": objects}
-        out.append(_row(f"a{len(out)}", "association", own, kind))
+        content = {"subjects": subject, "objects": objects}
+        out.append(_row(f"a{len(out)}", "association", content, kind))
 
     for key, lane in lanes.items():
-        found = {
+        neighbours = {
             "NEXT_LANE": lane.successors,
             "PREVIOUS_LANE": before[key],
             "LEFT_LANE": (lane.left_neighbour,),
             "RIGHT_LANE": (lane.right_neighbour,),
         }
-        for kind, others in found.items():
+        for kind, others in neighbours.items():
             objects = [ids[other] for other in others if other is not None and other in ids]
             if objects:
                 add(kind, ids[key], objects)
@@ -233,8 +233,8 @@ def _wait_lines(
     out = []
     for i, line in enumerate(lines):
         nearest = keys[int(np.argmin(shapely.distance(ends, shapely.linestrings(line[:, :2]))))]
-        own = {"location": _line(line), "category": "STOP", "is_implicit": is_implicit}
-        out.append(_row(f"wait{i}-{ids[nearest]}", "wait_line", own))
+        content = {"location": _line(line), "category": "STOP", "is_implicit": is_implicit}
+        out.append(_row(f"wait{i}-{ids[nearest]}", "wait_line", content))
     return out
 
 

@@ -34,11 +34,12 @@ from scenarios.usdz_tables import map_tables
 SHUTTER_US = 30_000  # of a camera that has none: AlpaSim wants every frame's end after its start
 GROUND_MARGIN_M = 30.0
 GROUND_NODES = 200_000
+# The words that AlpaSim classes by; others are kept.
 _LABELS = {
     "car": "automobile",
     "truck": "heavy_truck",
     "pedestrian": "person",
-}  # the words that AlpaSim classes by; others are kept
+}
 
 
 def write_usdz(path: Path, scenario: Scenario) -> None:

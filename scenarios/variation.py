@@ -28,7 +28,8 @@ from alpasim_plugin.core.seeding import stream
 from scenarios.schema import RangeSpec, ScenarioSpec
 from scenarios.schema_parts import Part
 
-JITTERED = {  # key of a number -> what `JitterSpec` calls its range
+# Key of a number -> what `JitterSpec` calls its range.
+JITTERED = {
     "length_m": "length",
     "curvature_per_m": "curvature",
     "start_curvature_per_m": "curvature",
@@ -46,7 +47,7 @@ AS_WRITTEN = 0  # the scene seed that jitters nothing
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SceneDraft:
     """A scenario file as a scene seed makes it."""
 
     document: Document  # with overrides and variations written into it, for the positions of keys
@@ -64,7 +65,7 @@ class Drawn:
             raise InputError(f"{self.document.mark(loc)}: {e.message}", e.hint) from e
 
 
-def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Drawn:
+def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> SceneDraft:
     """Validate a document and draw its variations and its jitter.
 
     Args:
@@ -107,16 +108,16 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
     again = [f"{'.'.join(map(str, loc))}={json.dumps(value)}" for loc, value in located]
     document = apply_overrides(document, again)
     spec = validate(ScenarioSpec, document)
-    seen: dict[str, int] = {}
+    index_by_id: dict[str, int] = {}
     for i, actor in enumerate(spec.actors):
-        if actor.id in seen:
-            first = document.mark(("actors", seen[actor.id], "id"))
+        if actor.id in index_by_id:
+            first = document.mark(("actors", index_by_id[actor.id], "id"))
             raise document.error(
                 ("actors", i, "id"),
                 f"duplicate actor id {actor.id!r}, first at {first}",
                 "give it another id",
             )
-        seen[actor.id] = i
+        index_by_id[actor.id] = i
     if spec.road is None and spec.actors:
         raise document.error(
             ("actors",),
@@ -125,7 +126,7 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Draw
         )
     if spec.seed != AS_WRITTEN:
         spec = _jitter(spec, scene_id, fixed)
-    return Drawn(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
+    return SceneDraft(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
 
 
 def _default_id(path: Path) -> str:
@@ -175,12 +176,12 @@ def _jitter(spec: ScenarioSpec, scene_id: str, fixed: Collection[str]) -> Scenar
         ) from None
 
 
-def differences(written: ScenarioSpec, drawn: ScenarioSpec) -> dict[str, tuple[Any, Any]]:
+def differences(written: ScenarioSpec, scene_spec: ScenarioSpec) -> dict[str, tuple[Any, Any]]:
     """Return every key whose value the scene seed has changed, dotted, with the value as written
     (None: absent) and as drawn.
     """
     before = _flat(written, ())
-    after = _flat(drawn, ())
+    after = _flat(scene_spec, ())
     return {
         key: (before.get(key), value) for key, value in after.items() if before.get(key) != value
     }
@@ -221,6 +222,6 @@ def _and_above(key: str) -> set[str]:
 
 def _by_id(key: str, ids: dict[str, str]) -> str:
     """Write ``actors.0.s_m`` as ``actors.lead.s_m``."""
-    head, _, rest = key.partition(".")
-    item, _, tail = rest.partition(".")
+    head, _, below = key.partition(".")
+    item, _, tail = below.partition(".")
     return f"actors.{ids[item]}.{tail}" if head == "actors" and item in ids else key

@@ -50,28 +50,26 @@ KEY_FILE = "import.json"
 FIT_FOLDER = "fit"
 POINTS_FILE = "points.ply"
 FIT_PX = 608  # least longer side of fitted views; half of the photograph's where that is more
-RENDER_PX, SIDE_PX = (
-    640,
-    16,
-)  # most of the longer side of the scenario's cameras; what their sides are multiples of, as fixers need
+RENDER_PX = 640  # most of the longer side of the scenario's cameras
+SIDE_PX = 16  # what the sides of these cameras are multiples of, as fixers need
 SEED = 0  # of the fit
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PlacedPhotograph:
     """A photograph of the drive in the scenario's world.
 
     Attributes:
-        photograph: As it was read.
+        source: The photograph as it was read.
         camera: Its camera's name in the scenario.
         use: ``fitted``, ``held-out`` or ``never-fitted``.
         T_world_camera: ``(4, 4)``.
         file: Where it lies in the imported folder.
     """
 
-    photograph: PosedPhotograph
+    source: PosedPhotograph
     camera: str
     use: str
     T_world_camera: F64
@@ -84,7 +82,7 @@ class Shown:
 
     def view(self) -> PosedView:
         """Return it as a view of the width that is fitted."""
-        full = replace(self.photograph, T_world_camera=self.T_world_camera).view()
+        full = replace(self.source, T_world_camera=self.T_world_camera).view()
         whole = full.camera.width
         width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
@@ -158,13 +156,13 @@ def _built(
 ) -> JsonObject:
     """Place, fit and measure a drive, and write all of it into a working folder."""
 
-    def placed_by(every: int) -> tuple[SourceDrive, PlacedDrive]:
+    def placed_by(stride: int) -> tuple[SourceDrive, PlacedDrive]:
         tell("correcting poses", 0, 1)
-        moved = with_corrected_poses(drive, every)
-        points = _points(fitted_part(moved, every), folder, tell)
+        moved = with_corrected_poses(drive, stride)
+        points = _points(fitted_part(moved, stride), folder, tell)
         return moved, place(moved, points, camera_height_m)
 
-    drive, placed, every = measured(placed_by)
+    drive, placed, stride = measured(placed_by)
     check_motion(drive, placed)
     roads, notes = (
         given_map(map_file, drive, placed)
@@ -172,29 +170,29 @@ def _built(
         else (corridor(placed.ego, placed.ground), (NO_MAP,))
     )
     drive = replace(drive, notes=(*drive.notes, *notes))
-    shown = shown_photographs(drive, placed, every)
+    photographs = placed_photographs(drive, placed, stride)
     begin(work, key)
-    write_photographs(work, shown, tell)
+    write_photographs(work, photographs, tell)
     actors = placed.actors
     views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
-    for one in shown:
-        present = actors_at(actors, int(one.photograph.t_us or 0))
-        views[one.use].append(replace(one.view(), actors=present))
-    seen = {name for view in views["fitted"] for name in _in_view(view)}
+    for photograph in photographs:
+        present = actors_at(actors, int(photograph.source.t_us or 0))
+        views[photograph.use].append(replace(photograph.view(), actors=present))
+    visible_ids = {name for view in views["fitted"] for name in _in_view(view)}
     near = placed.points.chosen(placed.points.spread < np.percentile(placed.points.spread, 90))
     done = fit_drive(
         views["fitted"],
         cloud_from_points(near.xyz, near.rgb),
         kept={view.name: view.camera for view in views["held-out"]},
-        boxes={one.actor_id: one.box for one in actors if one.actor_id in seen},
+        boxes={actor.actor_id: actor.box for actor in actors if actor.actor_id in visible_ids},
         scene_id=scene_id_of(drive),
         folder=work / FIT_FOLDER,
         seed=SEED,
-        report=lambda stage, at, all, numbers: tell(stage, at, all),
+        report=lambda stage, step, steps, numbers: tell(stage, step, steps),
         device=device,
     )
     quality = write_folder(
-        work, drive, placed, roads, done.model, shown, views, done.exposures, tell
+        work, drive, placed, roads, done.model, photographs, views, done.exposures, tell
     )
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
@@ -206,7 +204,7 @@ def write_folder(
     placed: PlacedDrive,
     roads: LaneMap,
     model: Reconstruction,
-    shown: Sequence[Shown],
+    photographs: Sequence[PlacedPhotograph],
     views: Mapping[str, Sequence[PosedView]],
     exposures: Mapping[str, tuple[float, float, float]],
     tell: Report,
@@ -219,7 +217,7 @@ def write_folder(
         drive, placed: The recording, as read and in the world.
         roads: Its map, or the corridor.
         model: Its reconstruction.
-        shown: The photographs, which lie in the folder.
+        photographs: The photographs, which lie in the folder.
         views: Use of the photographs to them as views; of the fitted ones only the cameras matter.
         exposures: Of each fitted view by its name.
         tell: Called as the work goes on.
@@ -238,7 +236,7 @@ def write_folder(
         placed.points.xyz,
         np.rint(placed.points.rgb * 255).clip(0, 255).astype(np.uint8),
     )
-    _write_transforms(work, shown, exposures)
+    _write_transforms(work, photographs, exposures)
     write_drive(work, log, standing.obstacles)
     comparisons, coverage = measure(model, views, exposures, tell)
     quality = write_page(work, drive, placed, standing, len(views["fitted"]), comparisons, coverage)
@@ -329,62 +327,68 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     )
 
 
-def shown_photographs(drive: SourceDrive, placed: PlacedDrive, every: int) -> list[Shown]:
-    """Return all photographs with their names, uses and places; one of ``every`` is held out."""
+def placed_photographs(
+    drive: SourceDrive, placed: PlacedDrive, stride: int
+) -> list[PlacedPhotograph]:
+    """Return all photographs with their names, uses and poses; one of ``stride`` is held out."""
     out = []
     for camera in drive.cameras:
         name = _name_of(drive, camera)
-        held = held_out(drive, camera, every)
+        held = held_out(drive, camera, stride)
         usual = "never-fitted" if camera in drive.never_fitted else "fitted"
-        for i, one in enumerate(drive.of(camera)):
+        for i, photograph in enumerate(drive.of(camera)):
             use = "held-out" if held[i] else usual
-            ending = one.file.suffix.lower() if one.data is None else ".jpg"
-            if one.lens.bends or (one.data is not None and bytes(one.data[:4]) == PNG[:4]):
+            ending = photograph.file.suffix.lower() if photograph.data is None else ".jpg"
+            if photograph.lens.bends or (
+                photograph.data is not None and bytes(photograph.data[:4]) == PNG[:4]
+            ):
                 ending = ".png"
             file = f"photographs/{name}/{i:06d}{ending}"
-            out.append(Shown(one, name, use, placed.poses[camera][i], file))
+            out.append(PlacedPhotograph(photograph, name, use, placed.poses[camera][i], file))
     return out
 
 
-def write_photographs(work: Path, shown: Sequence[Shown], tell: Report) -> None:
+def write_photographs(work: Path, photographs: Sequence[PlacedPhotograph], tell: Report) -> None:
     """Write the photographs without distortion; those that have none are copied as they are."""
-    for i, one in enumerate(shown):
-        path = work / one.file
-        tell("writing photographs", i + 1, len(shown))
+    for i, photograph in enumerate(photographs):
+        path = work / photograph.file
+        tell("writing photographs", i + 1, len(photographs))
         if os.path.isfile(path):
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        bends = one.photograph.lens.bends
+        bends = photograph.source.lens.bends
         data = (
-            cv2.imencode(".png", one.photograph.rgb()[..., ::-1])[1].tobytes()
+            cv2.imencode(".png", photograph.source.rgb()[..., ::-1])[1].tobytes()
             if bends
-            else one.photograph.encoded()
+            else photograph.source.encoded()
         )
         write_bytes(path, data)
 
 
 def _write_transforms(
-    work: Path, shown: Sequence[Shown], exposures: Mapping[str, tuple[float, float, float]]
+    work: Path,
+    photographs: Sequence[PlacedPhotograph],
+    exposures: Mapping[str, tuple[float, float, float]],
 ) -> None:
     frames = []
-    for one in shown:
-        lens = one.photograph.lens
-        K = one.photograph.lens.straight_K()
+    for photograph in photographs:
+        lens = photograph.source.lens
+        K = lens.straight_K()
         frame = {
-            "file_path": one.file,
-            "transform_matrix": one.T_world_camera.tolist(),
+            "file_path": photograph.file,
+            "transform_matrix": photograph.T_world_camera.tolist(),
             "w": lens.width,
             "h": lens.height,
             "fl_x": K[0, 0],
             "fl_y": K[1, 1],
             "cx": K[0, 2],
             "cy": K[1, 2],
-            "t_us": one.photograph.t_us,
-            "camera": one.camera,
-            "use": one.use,
+            "t_us": photograph.source.t_us,
+            "camera": photograph.camera,
+            "use": photograph.use,
         }
-        if one.name in exposures:
-            frame["exposure"] = list(exposures[one.name])
+        if photograph.name in exposures:
+            frame["exposure"] = list(exposures[photograph.name])
         frames.append(frame)
     document = {"axes": "opencv", "ply_file_path": POINTS_FILE, "frames": frames}
     write_json(work / TRANSFORMS_FILE, document)
@@ -392,9 +396,8 @@ def _write_transforms(
 
 def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str) -> RecordedLog:
     only_moved = drive.metric is not None and np.allclose(placed.T_world_source[:3, :3], np.eye(3))
-    origin = (
-        placed.T_world_source[:3, 3] if only_moved else np.zeros(3)
-    )  # a turned frame has no origin to subtract
+    # A turned frame has no origin to subtract.
+    origin = placed.T_world_source[:3, 3] if only_moved else np.zeros(3)
     x, y, z = np.negative(origin).tolist()
     cameras = [
         _camera(drive, placed, name)
@@ -419,14 +422,14 @@ def _log(drive: SourceDrive, placed: PlacedDrive, roads: LaneMap, scene_id: str)
 def _in_view(view: PosedView) -> list[str]:
     """Return the road users whose middle lies in an image."""
     camera = view.camera
-    found = []
+    visible_ids = []
     for name, T in view.actors.items():
         x, y, depth = (camera.T_camera_world @ T[:, 3])[:3]
         column = camera.fx * x / depth + camera.cx
         row = camera.fy * y / depth + camera.cy
         if depth > 0 and 0 <= column < camera.width and 0 <= row < camera.height:
-            found.append(name)
-    return found
+            visible_ids.append(name)
+    return visible_ids
 
 
 def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:

@@ -41,7 +41,8 @@ _NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FU
     SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"""
 MODELS = _NAMES.split()
 NUMBERS = {"CAMERA": CAMERA, "IMU": 1}  # of kinds of sensors
-PARAMETERS = {  # focal lengths and middle, then OpenCV's coefficients
+# Focal lengths and middle, then OpenCV's coefficients.
+PARAMETERS = {
     "SIMPLE_PINHOLE": 3,
     "PINHOLE": 4,
     "SIMPLE_RADIAL": 4,
@@ -66,9 +67,13 @@ class _Image:
 def models_in(folder: Path) -> list[Path]:
     """Return the folders in or below a folder that hold models, in natural order."""
     tops = [folder / place for place in PLACES]
-    below = [one for top in tops if os.path.isdir(top) for one in top.iterdir()]
-    found = {real(one): one for one in (*tops, *below) if _ending(one) is not None}
-    return sorted(found.values(), key=lambda one: natural_order(one.as_posix()))
+    below = [candidate for top in tops if os.path.isdir(top) for candidate in top.iterdir()]
+    models = {
+        real(candidate): candidate
+        for candidate in (*tops, *below)
+        if _ending(candidate) is not None
+    }
+    return sorted(models.values(), key=lambda candidate: natural_order(candidate.as_posix()))
 
 
 def _ending(model: Path) -> str | None:
@@ -88,44 +93,46 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
             no images.
     """
     models = [(model, _records(model, "images", _image)) for model in models_in(folder)]
-    model, images = max(models, key=lambda one: len(one[1]))
+    model, images = max(models, key=lambda model_images: len(model_images[1]))
     notes = []
     if len(models) > 1:
-        sizes = ", ".join(f"{one.relative_to(folder)}: {len(listed)}" for one, listed in models)
+        sizes = ", ".join(f"{path.relative_to(folder)}: {len(records)}" for path, records in models)
         notes.append(
             f"{len(models)} models, of which the one with most images is read: {model.relative_to(folder)} ({sizes} images)"
         )
-    images.sort(key=lambda one: natural_order(one.name))
+    images.sort(key=lambda record: natural_order(record.name))
     times_us, reference, rig_notes = _rig_times(model, images)
     if times_us:
-        images = [one for one in images if one.number in times_us]
+        images = [record for record in images if record.number in times_us]
     lenses = dict(_records(model, "cameras", _camera))
     table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
     root = _images_root(folder, model, images[0].name, need_files)
-    folders = {_folder(one.name) for one in images}
-    shared = times_us and len(folders) < len({one.camera for one in images})
+    folders = {_folder(record.name) for record in images}
+    shared = times_us and len(folders) < len({record.camera for record in images})
     shots: dict[str, list[PosedPhotograph]] = {}
     front = ""
-    for one in images:
-        if one.camera not in lenses:
-            raise InputError(f"{model}: images of camera {one.camera}, which it lacks", DO_THIS)
-        name = f"camera-{one.camera}" if shared else _folder(one.name)
-        where = f"{model}, image {one.name}"
-        time_us = times_us.get(one.number)
-        lens = lenses[one.camera]
-        shot = PosedPhotograph(root / one.name, lens, one.T_world_camera, where, time_us, name, {})
+    for record in images:
+        if record.camera not in lenses:
+            raise InputError(f"{model}: images of camera {record.camera}, which it lacks", DO_THIS)
+        name = f"camera-{record.camera}" if shared else _folder(record.name)
+        location = f"{model}, image {record.name}"
+        time_us = times_us.get(record.number)
+        lens = lenses[record.camera]
+        shot = PosedPhotograph(
+            root / record.name, lens, record.T_world_camera, location, time_us, name, {}
+        )
         shots.setdefault(name, []).append(shot)
-        if one.camera == reference:
+        if record.camera == reference:
             front = front or name
     names = sorted(shots)
     front = next((name for name in names if "front" in name), front or names[0])
     cameras = [shots[name] for name in names]
-    photographs = [one for camera in cameras for one in camera] if times_us else timed(cameras)
-    centres = np.array([one.T_world_camera[:3, 3] for one in photographs])
-    some = centres[:: max(1, len(centres) // 32)]
-    near = scipy.spatial.KDTree(some).query(table[:, :3])[0]
+    photographs = [shot for camera in cameras for shot in camera] if times_us else timed(cameras)
+    centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
+    sampled_centres = centres[:: max(1, len(centres) // 32)]
+    near = scipy.spatial.KDTree(sampled_centres).query(table[:, :3])[0]
     spread = np.eye(3) * ((SPREAD * near) ** 2)[:, None, None]
     points = Points(table[:, :3], table[:, 3:] / 255.0, spread)
     notes += rig_notes

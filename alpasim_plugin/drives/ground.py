@@ -15,46 +15,32 @@ from alpasim_plugin.core.types import F64, Bool, HeightField
 from alpasim_plugin.drives.source import Points
 
 # In camera heights:
-STEP, AHEAD = (
-    0.3,
-    25.0,
-)  # of the path's samples; how far the strip goes on before and beyond the path, straight on
+STEP = 0.3  # between the path's samples
+AHEAD = 25.0  # how far the strip goes on before and beyond the path, straight on
 # Points with a lateral offset less than they lie below it are on what was driven over, for the most
 # part; the wider cone is for few points.
 CONES = (1.0, 1.6)
 STRIP = 1.6  # half the width of the strip that is fitted
-KNOTS, TILT_KNOTS, CROSS_KNOTS = (
-    2.0,
-    8.0,
-    0.4,
-)  # distance of the knots of height, of cross slope, and of the road's cross section
-BEND, RISE = (
-    0.03,
-    0.02,
-)  # usual second and first difference of the heights at knots, against the path
-TURN, CROSS = (
-    0.02,
-    0.02,
-)  # usual difference of neighbouring cross slopes, and second difference of the cross section
+KNOTS = 2.0  # between the knots of height
+TILT_KNOTS = 8.0  # between the knots of cross slope
+CROSS_KNOTS = 0.4  # between the knots of the road's cross section
+BEND = 0.03  # usual second difference of the heights at knots, against the path
+RISE = 0.02  # usual first difference of the heights at knots, against the path
+TURN = 0.02  # usual difference of neighbouring cross slopes
+CROSS = 0.02  # usual second difference of the cross section
 NOISE = 0.015  # of a surface
-LOOSE, TIGHT, ROUNDS = (
-    0.3,
-    0.06,
-    10,
-)  # where Tukey's weight ends, in the first round and in the last ones
-WHEELS, LATERAL_WEIGHT = (
-    0.8,
-    0.02,
-)  # half the width of what is driven over, and what points beside it count: kerbs come and go
-FEWEST, SECTION = 40, 3.0  # points that a strip needs; length of the sections that are assessed
-CROSS_AT: F64 = np.asarray(
-    np.arange(-4, 5) * CROSS_KNOTS, np.float64
-)  # offsets of the cross section's knots
-CELL_M, BESIDE_M, TILTED_M = (
-    1.0,
-    60.0,
-    6.0,
-)  # of the height field; beyond a lateral offset of TILTED_M it goes on level
+LOOSE = 0.3  # where Tukey's weight ends in the first round
+TIGHT = 0.06  # where Tukey's weight ends in the last rounds
+ROUNDS = 10
+WHEELS = 0.8  # half the width of what is driven over
+LATERAL_WEIGHT = 0.02  # what points beside that count: kerbs come and go
+FEWEST = 40  # points that a strip needs
+SECTION = 3.0  # length of the sections that are assessed
+# Offsets of the cross section's knots.
+CROSS_AT: F64 = np.asarray(np.arange(-4, 5) * CROSS_KNOTS, dtype=np.float64)
+CELL_M = 1.0  # of the height field
+BESIDE_M = 60.0  # how far the height field reaches to both sides of the path
+TILTED_M = 6.0  # lateral offset beyond which the height field goes on level
 
 
 class PathFrame:
@@ -67,17 +53,18 @@ class PathFrame:
         line = path[moved]
         s = arc_lengths(line[:, :2])
         ends = []
-        for at, away in ((s[0], min(s[-1], s[0] + 3 * unit)), (s[-1], max(s[0], s[-1] - 3 * unit))):
-            here, there = resample(line, [at, away], s)
-            direction = here - there
-            ends.append(
-                here + direction * (AHEAD * unit) / max(float(np.linalg.norm(direction[:2])), 1e-9)
-            )
+        first_chord = (s[0], min(s[-1], s[0] + 3 * unit))
+        last_chord = (s[-1], max(s[0], s[-1] - 3 * unit))
+        for end_s, inner_s in (first_chord, last_chord):
+            end, inner = resample(line, [end_s, inner_s], s)
+            direction = end - inner
+            length = max(float(np.linalg.norm(direction[:2])), 1e-9)
+            ends.append(end + direction * (AHEAD * unit) / length)
         line = np.concatenate([[ends[0]], line, [ends[1]]])
         s = arc_lengths(line[:, :2])
-        at = np.linspace(0.0, s[-1], max(2, int(s[-1] / (STEP * unit)) + 1))
-        self.line = resample(line, at, s)
-        self.s = at - AHEAD * unit
+        stations = np.linspace(0.0, s[-1], max(2, int(s[-1] / (STEP * unit)) + 1))
+        self.line = resample(line, stations, s)
+        self.s = stations - AHEAD * unit
         along = np.gradient(self.line[:, :2], axis=0)
         self.along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         self._tree = scipy.spatial.KDTree(self.line[:, :2])
@@ -178,10 +165,10 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     groups = [error[under & (section == one)] for one in np.unique(section[under])]
     errors = np.array([np.median(group) for group in groups if len(group) >= 8])
     below, tilt, _ = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
-    own = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
+    depths = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)
     return GroundStrip(
         frame,
-        -float(np.median(own)) * height,
+        -float(np.median(depths)) * height,
         fitted.knots * height,
         below * height,
         fitted.tilt_knots * height,
@@ -238,12 +225,10 @@ class _Strip:
         ).tocsr()
         k = len(CROSS_AT)
         arched = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(k - 2, k)) / CROSS
-        middle = (
-            scipy.sparse.csr_matrix(np.abs(CROSS_AT)[None] < CROSS_KNOTS / 2) / 1e-4
-        )  # the path's own height is that of the knots
-        cross = scipy.sparse.vstack(
-            [arched, middle, scipy.sparse.csr_matrix(CROSS_AT[None]) / 0.1]
-        )  # its slope is the tilt's
+        # The height of the path itself is that of the knots, and the slope is the tilt's.
+        middle = scipy.sparse.csr_matrix(np.abs(CROSS_AT)[None] < CROSS_KNOTS / 2) / 1e-4
+        slope = scipy.sparse.csr_matrix(CROSS_AT[None]) / 0.1
+        cross = scipy.sparse.vstack([arched, middle, slope])
         prior = scipy.sparse.block_diag([prior, cross]).tocsr()
         self.prior = (prior.T @ prior).tocsc()
 

@@ -15,26 +15,29 @@ from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
 
 # One photograph of so many is held out; of those that were not taken along a road, which are fewer.
-EVERY, EVERY_STILL = 8, 5
+# One photograph of so many is held out.
+EVERY = 8
+# The same for a drive in which no road was found below the path.
+EVERY_STILL = 5
 
 Measure = Callable[[int], tuple[SourceDrive, PlacedDrive]]
 
 
-def held_out(drive: SourceDrive, camera: str, every: int) -> Bool:
+def held_out(drive: SourceDrive, camera: str, stride: int) -> Bool:
     """Return which photographs ``(N,)`` of a camera are held out, in the order of time: the middle
-    one of ``every``; none of a camera that took fewer than `EVERY`, or that is never fitted.
+    one of ``stride``; none of a camera that took fewer than `EVERY`, or that is never fitted.
     """
     count = len(drive.of(camera))
     if count < EVERY or camera in drive.never_fitted:
         return np.zeros(count, np.bool_)
-    return np.asarray(np.arange(count) % every == every // 2, np.bool_)
+    return np.asarray(np.arange(count) % stride == stride // 2, np.bool_)
 
 
-def fitted_part(drive: SourceDrive, every: int) -> SourceDrive:
+def fitted_part(drive: SourceDrive, stride: int) -> SourceDrive:
     """Return the drive without the photographs that are held out."""
     kept = []
     for camera in drive.cameras:
-        held = held_out(drive, camera, every)
+        held = held_out(drive, camera, stride)
         kept += [one for one, is_held in zip(drive.of(camera), held, strict=True) if not is_held]
     return replace(drive, photographs=tuple(kept))
 

@@ -32,7 +32,8 @@ from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 
 # Left and right; the first pair that is there is read.
 PAIRS = (("image_2", "image_3"), ("image_0", "image_1"), ("image_l", "image_r"))
-ROWS = {  # of `calib.txt` by the folder of their images
+# Rows of `calib.txt` by the folder of their images.
+ROWS = {
     "image_l": "P0",
     "image_r": "P1",
     "image_0": "P0",
@@ -80,10 +81,10 @@ def read_kitti(folder: Path) -> SourceDrive:
                 spare.append(path.name)
                 continue
             lens = Lens(*check_image(read_bytes(path), path), K)
-            where = f"{folder}, photograph {i}"
+            location = f"{folder}, photograph {i}"
             camera = "left" if name == left else "right"
             pose = poses[i] @ T_left_camera
-            photographs.append(PosedPhotograph(path, lens, pose, where, times[i], camera, {}))
+            photographs.append(PosedPhotograph(path, lens, pose, location, times[i], camera, {}))
         if spare:
             notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
         alone = len(poses) - len(rows) + len(spare)
@@ -111,9 +112,9 @@ def _rows_of_poses(folder: Path, files: dict[str, list[Path]], poses: int) -> di
         InputError: Nothing says which pose belongs to a photograph, or many belong to none.
     """
     numbers = {name: name_numbers(paths) for name, paths in files.items()}
-    every = {number for column in numbers.values() for number in column}
-    first = min(every, default=0) if max(every, default=0) >= poses else 0
-    numbered = all(numbers.values()) and (first == 0 or max(every) - first + 1 == poses)
+    all_numbers = {number for column in numbers.values() for number in column}
+    first = min(all_numbers, default=0) if max(all_numbers, default=0) >= poses else 0
+    numbered = all(numbers.values()) and (first == 0 or max(all_numbers) - first + 1 == poses)
     for name, paths in files.items():
         if abs(len(paths) - poses) > (max(2, poses // 10) if numbered else 0):
             raise InputError(

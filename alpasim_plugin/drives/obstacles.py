@@ -28,9 +28,13 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.world.ground import height_at
 from scenarios.drive import Obstacle
 
-LOW_M, HIGH_M = 0.3, 2.0  # above the ground: below is kerb and grass, above a car passes
-OPAQUE, LARGEST_M = 0.3, 0.6  # of a Gaussian that counts; larger ones are background, or blur
-CELL_M, PIECE_M, REACH_M = 0.2, 1.0, 9.0  # of the grid, of a box along the path, and from the path
+LOW_M = 0.3  # above the ground: below is kerb and grass
+HIGH_M = 2.0  # above the ground: a car passes under what is higher
+OPAQUE = 0.3  # least opacity of a Gaussian that counts
+LARGEST_M = 0.6  # of a Gaussian that counts; larger ones are background, or blur
+CELL_M = 0.2  # of the grid
+PIECE_M = 1.0  # of the path: a box does not reach beyond its piece
+REACH_M = 9.0  # from the path
 LEAST_M2 = 0.06  # of opaque surface in a column of a cell: a wall has 0.34
 FEWEST = 3  # cells of something that stands
 # a gap in something that no car fits into is closed: dark doors and windows leave some in parked
@@ -95,14 +99,14 @@ def standing_obstacles(
     sizes = np.bincount(label.ravel())
     sizes[0] = 0
     kept = np.argwhere((sizes >= FEWEST)[label] & occupied)
-    at = low + (kept - 0.5) * CELL_M  # the cells' middles: the grid has a border of one cell
+    centres = low + (kept - 0.5) * CELL_M  # the cells' middles: the grid has a border of one cell
     tops = np.zeros(grid.shape)
     cells = np.floor((places[:, :2] - low) / CELL_M).astype(np.int64) + 1
     np.maximum.at(tops, (cells[:, 0], cells[:, 1]), above)
     tops = np.where(tops > 0, tops, scipy.ndimage.grey_dilation(tops, footprint=_disc(GAP_M / 2)))[
         kept[:, 0], kept[:, 1]
     ]
-    return Standing(tuple(_boxes(at, kept, tops, frame, ground, points)), cleared)
+    return Standing(tuple(_boxes(centres, kept, tops, frame, ground, points)), cleared)
 
 
 def _disc(radius_m: float) -> Bool:
@@ -124,18 +128,18 @@ def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
     axes = np.take_along_axis(matrix_from_quat(quats), order[:, None, :], axis=2)  # (N, 3, 2)
     sizes = np.take_along_axis(scales, order, axis=1)
     ends = np.moveaxis(axes * sizes[:, None, :], 2, 0)
-    shown = [means, *(means + sign * end for end in ends for sign in (1, -1))]
-    surface = np.pi * sizes[:, 0] * sizes[:, 1] * opacities / len(shown)
-    return np.concatenate(shown), np.tile(surface, len(shown))
+    positions = [means, *(means + sign * end for end in ends for sign in (1, -1))]
+    surface = np.pi * sizes[:, 0] * sizes[:, 1] * opacities / len(positions)
+    return np.concatenate(positions), np.tile(surface, len(positions))
 
 
 def _boxes(
-    at: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField, points: Points
+    centres: F64, cells: I64, tops: F64, frame: PathFrame, ground: HeightField, points: Points
 ) -> list[Obstacle]:
     """Return boxes around cells ``(N, 2)`` that are connected within a piece of the path, along the
     path's own direction.
     """
-    s, left, _ = frame.place(at)
+    s, left, _ = frame.place(centres)
     group = np.stack([np.floor(s / PIECE_M), left > 0], axis=1)
     pairs = scipy.spatial.KDTree(cells).query_pairs(1.5, output_type="ndarray")
     pairs = pairs[(group[pairs[:, 0]] == group[pairs[:, 1]]).all(axis=1)]
@@ -146,14 +150,14 @@ def _boxes(
     tree = scipy.spatial.KDTree(points.xyz[:, :2]) if len(points) else None
     out: list[Obstacle] = []
     for number in range(count):
-        mine = label == number
-        k = int(np.clip(np.searchsorted(frame.s, s[mine].mean()), 0, len(frame.s) - 1))
+        in_group = label == number
+        k = int(np.clip(np.searchsorted(frame.s, s[in_group].mean()), 0, len(frame.s) - 1))
         along = frame.along[k]
         across = left_of(along)
-        u = at[mine] @ along
-        v = at[mine] @ across
+        u = centres[in_group] @ along
+        v = centres[in_group] @ across
         middle = along * (u.max() + u.min()) / 2 + across * (v.max() + v.min()) / 2
-        top = float(tops[mine].max())
+        top = float(tops[in_group].max())
         base = float(height_at(ground, middle[None])[0])
         spread = UNSEEN_M
         if tree is not None:

@@ -144,15 +144,15 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
             "check the unit of the times (t_us: microseconds) and of the poses",
         )
     if speed[fast] > MOST_MPS:
-        at = fast + 1
-        found = f"{speed[fast]:.0f} m/s"
+        index = fast + 1
+        fault = f"{speed[fast]:.0f} m/s"
     elif len(jumps):
-        at = int(jumps[0]) + 2
-        found = f"its speed changes by {change[jumps[0]]:.0f} m/s in {dt_s[jumps[0] + 1]:.2g} s"
+        index = int(jumps[0]) + 2
+        fault = f"its speed changes by {change[jumps[0]]:.0f} m/s in {dt_s[jumps[0] + 1]:.2g} s"
     else:
         return
     raise InputError(
-        f"{photographs[at].where}, {photographs[at].file.name}: {found}, which no car does",
+        f"{photographs[index].where}, {photographs[index].file.name}: {fault}, which no car does",
         "check the order of the photographs, their times (t_us) and the unit of the poses",
     )
 
@@ -168,9 +168,9 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
         strip = fit_ground(points.moved(T), front[:, :3, 3] @ T[:3, :3].T + T[:3, 3])
         if strip is None:
             break
-        own = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
-        line = strip.frame.line[own]
-        along = strip.frame.along[own]
+        on_path = (strip.frame.s >= 0) & (strip.frame.s <= strip.frame.s[-1] + strip.frame.s[0])
+        line = strip.frame.line[on_path]
+        along = strip.frame.along[on_path]
         left = left_of(along)
         xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
         A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
@@ -250,9 +250,8 @@ def _rig(
     turns = []
     for pose, along in zip(front[moving], step[moving], strict=True):
         heading = unit(along[:2])
-        if (
-            heading @ pose[:2, 2] < 0
-        ):  # it looks back, or the drive goes backwards: the camera's own direction counts
+        # It looks back, or the drive goes backwards: the camera's own direction counts.
+        if heading @ pose[:2, 2] < 0:
             heading = pose[:2, 2] / max(float(np.linalg.norm(pose[:2, 2])), 1e-9)
         ahead = (
             float(
@@ -362,9 +361,9 @@ def laid_map(lane_map: LaneMap, ground: HeightField) -> LaneMap:
     def raised(points: F64) -> F64:
         return points + np.array([0.0, 0.0, raised_m(points[0])])
 
-    def signal_on(one: Signal) -> Signal:
-        head = None if one.head is None else raised(one.head[None])[0]
-        return replace(one, stop=laid(one.stop, ground), head=head)
+    def signal_on(signal: Signal) -> Signal:
+        head = None if signal.head is None else raised(signal.head[None])[0]
+        return replace(signal, stop=laid(signal.stop, ground), head=head)
 
     lines: dict[str, Any] = {
         name: tuple(laid(line, ground) for line in getattr(lane_map, name))
@@ -373,12 +372,14 @@ def laid_map(lane_map: LaneMap, ground: HeightField) -> LaneMap:
     return replace(
         lane_map,
         lanes=lanes,
-        markings=tuple(replace(one, xyz=laid(one.xyz, ground)) for one in lane_map.markings),
+        markings=tuple(
+            replace(marking, xyz=laid(marking.xyz, ground)) for marking in lane_map.markings
+        ),
         poles=tuple(raised(pole) for pole in lane_map.poles),
         signs=tuple(
             (shifted(0.0, 0.0, raised_m(pose[:3, 3])) @ pose, box) for pose, box in lane_map.signs
         ),
-        signals=lane_map.signals and tuple(signal_on(one) for one in lane_map.signals),
-        give_way=tuple(signal_on(one) for one in lane_map.give_way),
+        signals=lane_map.signals and tuple(signal_on(signal) for signal in lane_map.signals),
+        give_way=tuple(signal_on(signal) for signal in lane_map.give_way),
         **lines,
     )

@@ -39,11 +39,10 @@ from alpasim_plugin.gaussians.fit.tracks import (
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 WIDTH_PX = 1280  # following and matching need no more
-ERROR_PX, PIXEL_SPREAD = (
-    1.2,
-    0.3,
-)  # of a point in each photograph that places it: largest, and usual
-FEWEST_VIEWS, LEAST_ANGLE_RAD = 3, np.radians(0.7)  # that place a point; between its outermost rays
+ERROR_PX = 1.2  # largest error of a point in each photograph that places it
+PIXEL_SPREAD = 0.3  # usual error of a point in such a photograph
+FEWEST_VIEWS = 3  # that place a point
+LEAST_ANGLE_RAD = np.radians(0.7)  # between the outermost rays of a point
 FEWEST_POINTS = 60
 
 
@@ -88,35 +87,35 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
         tracks = tracks.only(place(tracks, cameras).error_px < 3 * ERROR_PX)
     if not tracks.count:
         return Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    found = place(tracks, cameras)
+    placement = place(tracks, cameras)
     worst = np.zeros(tracks.count)
     count = np.bincount(tracks.point, minlength=tracks.count)
-    np.maximum.at(worst, tracks.point, found.error_px)
+    np.maximum.at(worst, tracks.point, placement.error_px)
     good = (
         (count >= FEWEST_VIEWS)
         & (worst < ERROR_PX)
-        & (found.angle_rad > LEAST_ANGLE_RAD)
-        & np.isfinite(found.xyz).all(axis=1)
+        & (placement.angle_rad > LEAST_ANGLE_RAD)
+        & np.isfinite(placement.xyz).all(axis=1)
     )
     begins = np.searchsorted(tracks.point, np.arange(tracks.count))
     colours = np.array([_colour(views[tracks.view[i]], tracks.at[i]) for i in begins]).reshape(
         -1, 3
     )
     R, t, K = pose_arrays(cameras)
-    _, slope, _ = residuals(found.xyz, tracks, R, t, K)
+    _, slope, _ = residuals(placement.xyz, tracks, R, t, K)
     J = slope @ R[tracks.view]
     H = np.zeros((tracks.count, 3, 3))
     np.add.at(H, tracks.point, J.transpose(0, 2, 1) @ J)
     return Points(
-        found.xyz,
+        placement.xyz,
         colours,
         np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, np.float64),
     ).chosen(good)
 
 
-def _colour(view: PosedView, at: F64) -> F64:
-    row = min(int(at[1]), view.camera.height - 1)
-    column = min(int(at[0]), view.camera.width - 1)
+def _colour(view: PosedView, pixel: F64) -> F64:
+    row = min(int(pixel[1]), view.camera.height - 1)
+    column = min(int(pixel[0]), view.camera.width - 1)
     return view.rgb[row, column] / 255.0
 
 
@@ -124,20 +123,20 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     """Return tracks of features that were matched between near photographs; one that meets a
     photograph twice is left out.
     """
-    found = matches(views)
-    if not found:
+    pairs = matches(views)
+    if not pairs:
         return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
     ends = np.array(
-        [[m.first, *m.at_first] for m in found] + [[m.second, *m.at_second] for m in found]
+        [[m.first, *m.at_first] for m in pairs] + [[m.second, *m.at_second] for m in pairs]
     )
-    seen, number = np.unique(ends, axis=0, return_inverse=True)
+    features, number = np.unique(ends, axis=0, return_inverse=True)
     number = number.ravel()
-    n = len(found)
+    n = len(pairs)
     graph = scipy.sparse.coo_matrix(
-        (np.ones(n), (number[:n], number[n:])), shape=(len(seen), len(seen))
+        (np.ones(n), (number[:n], number[n:])), shape=(len(features), len(features))
     )
     _, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    view = seen[:, 0].astype(np.int64)
+    view = features[:, 0].astype(np.int64)
     _, index, times = np.unique(
         np.stack([label, view], axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -148,27 +147,27 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     return Tracks(
         view[keep][order],
         point.astype(np.int64),
-        seen[keep][order, 1:],
+        features[keep][order, 1:],
         int(point.max(initial=-1)) + 1,
     )
 
 
-def agreeing(one: PosedPhotograph, other: PosedPhotograph, turns: Sequence[F64]) -> list[int]:
+def agreeing(first: PosedPhotograph, second: PosedPhotograph, turns: Sequence[F64]) -> list[int]:
     """Return for each turn of the camera's axes how many matches of two photographs lie before
     both, where both see them.
 
     Args:
-        one, other: Photographs.
+        first, second: Photographs.
         turns: ``(4, 4)`` each, applied to the poses on the camera's side.
     """
-    views = [small_view(photograph) for photograph in (one, other)]
+    views = [small_view(photograph) for photograph in (first, second)]
     views = [resized(view, 640) if view.camera.width > 640 else view for view in views]
-    found = matches(views)
-    n = len(found)
+    pairs = matches(views)
+    n = len(pairs)
     if not n:
         return [0 for _ in turns]
-    at = np.array([[m.at_first, m.at_second] for m in found]).reshape(-1, 2)
-    tracks = Tracks(np.tile([0, 1], n), np.repeat(np.arange(n), 2), at, n)
+    pixels = np.array([[m.at_first, m.at_second] for m in pairs]).reshape(-1, 2)
+    tracks = Tracks(np.tile([0, 1], n), np.repeat(np.arange(n), 2), pixels, n)
     counts = []
     for turn in turns:
         turned = [
@@ -180,16 +179,17 @@ def agreeing(one: PosedPhotograph, other: PosedPhotograph, turns: Sequence[F64])
     return counts
 
 
-NEAR, FAR = 2.0, 9.0  # of the piece of road that is looked at, in camera heights
+# Begin and end of the piece of road that is looked at, in camera heights.
+NEAR = 2.0
+FAR = 9.0
 # To both sides: under the wheels, where there is least to see, and beside them.
 LATERAL = (0.75, 1.5)
-CORNERS, CORNER_CONTRAST, APART_PX = (
-    (250, 60),
-    0.01,
-    6.0,
-)  # in each of the two; contrast is relative, and asphalt is faint
+CORNERS = (250, 60)  # in each of the two
+CORNER_CONTRAST = 0.01  # relative: asphalt is faint
+APART_PX = 6.0  # between corners
 NEXT = (1, 2, 3)  # photographs
-WINDOW_PX, BACK_PX = 21, 0.25  # of the flow; how near it must come back
+WINDOW_PX = 21  # of the flow
+BACK_PX = 0.25  # how near a point must come back to where it was
 MOST_PX = 12.0  # more than this and the plane was no prediction
 
 
@@ -212,11 +212,11 @@ def road_points(photographs: Sequence[PosedPhotograph], poses: F64, strip: Groun
     rows = [np.zeros((0, 4))]
     count = 0
     for i in range(len(shots) - 1):
-        found = _tracked(i, shots, strip)
-        if len(found):
-            found[:, 0] += count
-            count = int(found[-1, 0]) + 1
-            rows.append(found)
+        observations = _tracked(i, shots, strip)
+        if len(observations):
+            observations[:, 0] += count
+            count = int(observations[-1, 0]) + 1
+            rows.append(observations)
     table = np.concatenate(rows)
     tracks = Tracks(table[:, 1].astype(np.int64), table[:, 0].astype(np.int64), table[:, 2:], count)
     return placed(tracks, views)
@@ -235,18 +235,18 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
         for n, m in zip(CORNERS, masks, strict=True)
         if m.any()
     ]
-    at = np.concatenate(
+    corners_px = np.concatenate(
         [np.zeros((0, 2)), *(one.reshape(-1, 2) for one in corners if one is not None)]
     ).astype(np.float32)
-    if not len(at):
+    if not len(corners_px):
         return np.zeros((0, 4))
     local = transform_points(camera.T_camera_world, pieces[0])
     middle = local.mean(axis=0)
     normal = np.linalg.svd(local - middle)[2][2]
     away = float(normal @ middle)
-    rows = [_rows(np.arange(len(at)), i, at.astype(np.float64))]
+    rows = [_rows(np.arange(len(corners_px)), i, corners_px.astype(np.float64))]
     for j in (i + k for k in NEXT if i + k < len(shots)):
-        other, shown = shots[j]
+        other, other_image = shots[j]
         move = other.T_camera_world @ inverse(camera.T_camera_world)
         H = (
             other.K
@@ -256,42 +256,53 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
         from_corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
         H = np.linalg.inv(from_corner) @ H @ from_corner  # OpenCV counts from pixel centres
         warped = cv2.warpPerspective(
-            shown, H, (camera.width, camera.height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            other_image,
+            H,
+            (camera.width, camera.height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         )
-        moved, good = _flow(image, warped, at)
-        there = cv2.perspectiveTransform(moved[:, None].astype(np.float64), H).reshape(-1, 2)
-        good &= ((there >= 0) & (there < [other.width, other.height])).all(axis=1)
+        moved, good = _flow(image, warped, corners_px)
+        pixels = cv2.perspectiveTransform(moved[:, None].astype(np.float64), H).reshape(-1, 2)
+        good &= ((pixels >= 0) & (pixels < [other.width, other.height])).all(axis=1)
         which = np.nonzero(good)[0]
-        rows.append(_rows(which, j, there[which]))
-    found = np.concatenate(rows)
-    return found[np.argsort(found[:, 0], kind="stable")]
+        rows.append(_rows(which, j, pixels[which]))
+    observations = np.concatenate(rows)
+    return observations[np.argsort(observations[:, 0], kind="stable")]
 
 
-def _rows(track: I64, view: int, at: F64) -> F64:
-    return np.column_stack([track, np.full(len(at), view), at + 0.5])
+def _rows(track: I64, view: int, pixels: F64) -> F64:
+    return np.column_stack([track, np.full(len(pixels), view), pixels + 0.5])
 
 
-def _flow(image: U8, warped: U8, at: F32) -> tuple[F32, Bool]:
+def _flow(image: U8, warped: U8, corners_px: F32) -> tuple[F32, Bool]:
     """Return where points moved to, and which came back to where they were."""
     options = {
         "winSize": (WINDOW_PX, WINDOW_PX),
         "maxLevel": 2,
         "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
     }
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, at, at.copy(), **options)  # type: ignore[call-overload]
-    back, again, _ = cv2.calcOpticalFlowPyrLK(warped, image, moved, at.copy(), **options)  # type: ignore[call-overload]
-    good = (found.ravel() > 0) & (again.ravel() > 0) & (np.linalg.norm(back - at, axis=1) < BACK_PX)
-    return moved, good & (np.linalg.norm(moved - at, axis=1) < MOST_PX)
+    moved, has_flow, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
+        image, warped, corners_px, corners_px.copy(), **options
+    )
+    back, has_return, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
+        warped, image, moved, corners_px.copy(), **options
+    )
+    good = (
+        (has_flow.ravel() > 0)
+        & (has_return.ravel() > 0)
+        & (np.linalg.norm(back - corners_px, axis=1) < BACK_PX)
+    )
+    return moved, good & (np.linalg.norm(moved - corners_px, axis=1) < MOST_PX)
 
 
 def _piece_ahead(strip: GroundStrip, centre: F64, lateral: float) -> F64:
     """Return corners ``(8, 3)`` of the piece of road ahead of a camera, on the strip, to ``lateral``
     camera heights of lateral offset.
     """
-    here = strip.frame.place(centre[None])[0][0]
+    station = strip.frame.place(centre[None])[0][0]
     out = []
     for ahead in np.linspace(NEAR, FAR, 4) * strip.height:
-        k = int(np.clip(np.searchsorted(strip.frame.s, here + ahead), 0, len(strip.frame.s) - 1))
+        k = int(np.clip(np.searchsorted(strip.frame.s, station + ahead), 0, len(strip.frame.s) - 1))
         along = strip.frame.along[k]
         left = lateral * strip.height * left_of(along)
         out += [strip.frame.line[k, :2] + left, strip.frame.line[k, :2] - left]
@@ -312,13 +323,12 @@ def _mask(camera: PinholeCamera, piece: F64) -> U8:
 
 CORRECTING_PX = 640  # corners are followed at a tenth of a pixel: more is not needed
 LEAST_GAIN = 0.9  # the error must fall below this share of what it was
-FARTHEST_M, FARTHEST_RAD = (
-    0.5,
-    0.05,
-)  # of a correction; more is another fault than a recorder's noise
+# Largest correction of a pose: more is another fault than a recorder's noise.
+FARTHEST_M = 0.5
+FARTHEST_RAD = 0.05
 
 
-def with_corrected_poses(drive: SourceDrive, every: int) -> SourceDrive:
+def with_corrected_poses(drive: SourceDrive, stride: int) -> SourceDrive:
     """Return the drive with the front camera's poses adjusted to its photographs, and every other
     photograph moved as the rig was at its time.
 
@@ -326,16 +336,17 @@ def with_corrected_poses(drive: SourceDrive, every: int) -> SourceDrive:
 
     Args:
         drive: As its files say it.
-        every: One photograph of so many is held out, whose pixels say nothing.
+        stride: One photograph of so many is held out, whose pixels say nothing.
     """
     if drive.metric is None or drive.points is not None or drive.kind == "colmap":
         return drive
-    front = fitted_part(drive, every).of(drive.front)
-    found = corrected([small_view(photograph, CORRECTING_PX) for photograph in front])
-    if not found.after_px < LEAST_GAIN * found.before_px:  # also where there is nothing to say: NaN
+    front = fitted_part(drive, stride).of(drive.front)
+    correction = corrected([small_view(photograph, CORRECTING_PX) for photograph in front])
+    # Negated: where nothing was measured the errors are NaN, and the poses stay.
+    if not correction.after_px < LEAST_GAIN * correction.before_px:
         return drive
     old = np.array([photograph.T_world_camera for photograph in front])
-    new = np.array([inverse(camera.T_camera_world) for camera in found.cameras])
+    new = np.array([inverse(camera.T_camera_world) for camera in correction.cameras])
     corrections = np.array([inverse(T) for T in old]) @ new  # in the camera's axes
     traces = np.trace(corrections[:, :3, :3], axis1=1, axis2=2)
     turned_rad = float(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max())
@@ -344,7 +355,7 @@ def with_corrected_poses(drive: SourceDrive, every: int) -> SourceDrive:
         return drive
     note = (
         f"poses were corrected by the photographs, by up to {100 * shifted_m:.0f} cm and {np.degrees(turned_rad):.2f} degrees: "
-        f"points are met to {found.after_px:.2f} instead of {found.before_px:.2f} pixels"
+        f"points are met to {correction.after_px:.2f} instead of {correction.before_px:.2f} pixels"
     )
     times = np.array([int(photograph.t_us or 0) for photograph in front])
     moved = moved_rig(drive, trajectory_from_poses(times, corrections))

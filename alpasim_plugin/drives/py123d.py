@@ -31,7 +31,9 @@ from scenarios.recorded import actors_of_track, checked_trajectory
 _Member = TypeVar("_Member")
 UNIT = 0.01  # how far from 1 the length of a quaternion may be
 SYNC_FILE = "sync.arrow"
-EGO, BOXES, CAMERA = "ego_state_se3", "box_detections_se3", "camera."
+EGO = "ego_state_se3"
+BOXES = "box_detections_se3"
+CAMERA = "camera."
 DO_THIS = "convert the log again with py123d 0.1 or later"
 FRONT = ("pcam_f0", "pcam_stereo_l")  # the first that is there is driven by
 SPARE = "pcam_stereo_r"  # shows what the left one shows: kept for measuring
@@ -68,14 +70,14 @@ def read_py123d(folder: Path) -> SourceDrive:
     with parsing(folder / SYNC_FILE, DO_THIS):
         scene_id = str(log["log_name"])
     body, (times, poses) = _modality(folder, EGO, ("timestamp_us", "imu_se3"))
-    where = folder / f"{EGO}.arrow"
-    with parsing(where, DO_THIS):
+    location = folder / f"{EGO}.arrow"
+    with parsing(location, DO_THIS):
         if times.null_count:
             raise ValueError("a row without a time")
         table = np.array(poses.to_pylist(), np.float64).reshape(-1, 7)
-        ego = checked_trajectory(where, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
+        ego = checked_trajectory(location, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
         for name in ("length", "width", "height", "wheel_base"):
-            BODY_M.check(body[name], f"{where}: {name}")
+            BODY_M.check(body[name], f"{location}: {name}")
         T_imu_axle = _T(body["rear_axle_to_imu_se3"])
         T_imu_centre = _T(body["center_to_imu_se3"])
         vehicle = Vehicle(
@@ -94,10 +96,12 @@ def read_py123d(folder: Path) -> SourceDrive:
         raise InputError(f"{folder}: no pinhole camera with images", DO_THIS)
     front = next((name for name in FRONT if name in cameras), min(cameras))
     last_us = int(cameras[front][: int(PHOTOGRAPHS.high)][-1].t_us or 0)
-    every = [one for photographs in cameras.values() for one in photographs]
-    chosen = tuple(one for one in every if int(one.t_us or 0) <= last_us)
-    if len(chosen) < len(every):
-        notes.append(f"{len(every) - len(chosen)} photographs after the first of {front} left out")
+    all_photographs = [one for photographs in cameras.values() for one in photographs]
+    chosen = tuple(one for one in all_photographs if int(one.t_us or 0) <= last_us)
+    if len(chosen) < len(all_photographs):
+        notes.append(
+            f"{len(all_photographs) - len(chosen)} photographs after the first of {front} left out"
+        )
     actors = _actors(folder, notes) if BOXES in keys else ()
     unread = [key for key in keys if key not in ("sync", EGO, BOXES) and not key.startswith(CAMERA)]
     if unread:
@@ -144,10 +148,10 @@ def _T(pose: Sequence[float]) -> F64:
     return se3(pose[:3], pose[3:7])
 
 
-def _numbered(members: Sequence[_Member], number: int, what: str) -> _Member:
+def _numbered(members: Sequence[_Member], number: int, noun: str) -> _Member:
     """Return the member of a number that a log states."""
     if not 0 <= number < len(members):
-        raise ValueError(f"{what} {number} of {len(members)}")
+        raise ValueError(f"{noun} {number} of {len(members)}")
     return members[number]
 
 
@@ -179,8 +183,8 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
             raise ValueError(f"images of the type {data.type}")
         photographs = []
         for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
-            where = f"{path}, row {i}"
-            T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), where)
+            location = f"{path}, row {i}"
+            T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), location)
             file = path
             encoded = None
             if pa.types.is_string(data.type):
@@ -192,7 +196,7 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
                 frame = _numbered(film, value.as_py(), "frame") if is_film else value.as_buffer()
                 encoded = memoryview(frame)
             photographs.append(
-                PosedPhotograph(file, lens, T, where, int(t_us[i]), name, {}, encoded)
+                PosedPhotograph(file, lens, T, location, int(t_us[i]), name, {}, encoded)
             )
     return photographs
 
@@ -222,19 +226,21 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
                 tracks.setdefault(str(token), []).append([t_us, *box, label])
         if kind not in CLASSES:
             notes.append(f"road users of the unknown classes {kind} are labelled 'other'")
-        found: list[Actor] = []
+        actors: list[Actor] = []
         for token in sorted(tracks):
             table = np.array(tracks[token], np.float64).reshape(-1, 12)
             number = int(table[0, 11])
             letter = _numbered(CLASSES[kind], number, "label") if kind in CLASSES else "o"
             times = table[:, 0].astype(np.int64)
-            where = f"{path}, track {token}"
-            track = checked_trajectory(where, times, table[:, 1:4], table[:, 4:8])
+            location = f"{path}, track {token}"
+            track = checked_trajectory(location, times, table[:, 1:4], table[:, 4:8])
             length_m, width_m, height_m = np.median(table[:, 8:11], axis=0).tolist()
             for side_m in (length_m, width_m, height_m):
-                BODY_M.check(side_m, where)
+                BODY_M.check(side_m, location)
             box = Box(length_m, width_m, height_m)
-            found += actors_of_track(token, LABELS[letter], box, track)
-    moving = tuple(one for one in found if not one.is_static and len(one.track) > 1)
-    notes.append(f"{len(moving)} road users move; boxes of {len(found) - len(moving)} are not used")
+            actors += actors_of_track(token, LABELS[letter], box, track)
+    moving = tuple(one for one in actors if not one.is_static and len(one.track) > 1)
+    notes.append(
+        f"{len(moving)} road users move; boxes of {len(actors) - len(moving)} are not used"
+    )
     return moving

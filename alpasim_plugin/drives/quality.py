@@ -27,7 +27,8 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 LATERAL_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
 OPAQUE = 0.5
-SHOWN, COVERED = 3, 8  # photographs of each use on the page; views that measure coverage
+EXAMPLES = 3  # photographs of each use on the page
+COVERED = 8  # views that measure coverage
 IMAGES = "images"
 Report = Callable[[str, int, int], None]
 
@@ -46,10 +47,10 @@ def measure(
         of the lower half of the image that the model covers.
     """
     graph = model.graph()
-    known = [view for view in views["fitted"] if view.name in exposures]
-    cameras = [view.camera_name for view in known]
-    centres = np.array([view.camera.centre_world for view in known])
-    gains = np.array([exposures[view.name] for view in known])
+    exposed_views = [view for view in views["fitted"] if view.name in exposures]
+    cameras = [view.camera_name for view in exposed_views]
+    centres = np.array([view.camera.centre_world for view in exposed_views])
+    gains = np.array([exposures[view.name] for view in exposed_views])
 
     def compared(view: PosedView) -> Comparison:
         place = view.camera.centre_world
@@ -61,9 +62,9 @@ def measure(
         if chosen:
             tell(f"measuring {use} photographs", 0, 1)
             rows[use] = [compared(view) for view in chosen]
-    some = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
+    sample_views = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {
-        lateral_m: float(np.mean([_covered(graph, view, lateral_m) for view in some]))
+        lateral_m: float(np.mean([_covered(graph, view, lateral_m) for view in sample_views]))
         for lateral_m in LATERAL_M
     }
     return rows, coverage
@@ -72,8 +73,8 @@ def measure(
 def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
     present = {name: T for name, T in view.actors.items() if name in graph.actors}
     out = graph.render(view.camera, present)
-    shown = out.exposed(gain).to_uint8()
-    return Comparison(view.name, shown, view.rgb, psnr_db(shown, view.rgb), ssim(shown, view.rgb))
+    image = out.exposed(gain).to_uint8()
+    return Comparison(view.name, image, view.rgb, psnr_db(image, view.rgb), ssim(image, view.rgb))
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -113,14 +114,14 @@ def write_page(
         What ``quality.json`` holds.
     """
     (folder / IMAGES).mkdir(exist_ok=True)
-    shown = []
+    examples = []
     for use, rows in comparisons.items():
-        for i in _spread(len(rows), SHOWN):
+        for i in _spread(len(rows), EXAMPLES):
             name = f"{IMAGES}/{use}-{rows[i].name}.jpg"
-            both = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
-            data = cv2.imencode(".jpg", np.ascontiguousarray(both[..., ::-1]))[1].tobytes()
+            image = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
+            data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
             write_bytes(folder / name, data)
-            shown.append((use, rows[i], name))
+            examples.append((use, rows[i], name))
     spread = [one.uncertainty_m for one in standing.obstacles]
     quality = {
         "source": drive.kind,
@@ -144,7 +145,7 @@ def write_page(
         "notes": [*drive.notes, *placed.notes],
     }
     write_json(folder / "quality.json", quality)
-    write_text(folder / "quality.md", _page(drive, quality, shown))
+    write_text(folder / "quality.md", _page(drive, quality, examples))
     return quality
 
 
@@ -153,7 +154,7 @@ def _mean(rows: Sequence[Comparison], name: str) -> float:
 
 
 def _page(
-    drive: SourceDrive, quality: Mapping[str, Any], shown: Sequence[tuple[str, Comparison, str]]
+    drive: SourceDrive, quality: Mapping[str, Any], examples: Sequence[tuple[str, Comparison, str]]
 ) -> str:
     rows = "\n".join(
         f"| {use} | {count} | {quality[use]['psnr_db']:.2f} | {quality[use]['ssim']:.3f} |"
@@ -191,7 +192,7 @@ def _page(
         "by mistake and were taken as free.",
         "## Photograph above, reconstruction below",
     ]
-    for use, row, name in shown:
+    for use, row, name in examples:
         title = escape(row.name)
         sections += [f"{use}, {title}: {row.psnr_db:.2f} dB", f"![{title}]({quote(name)})"]
     return "\n\n".join(sections) + "\n"

@@ -18,9 +18,8 @@ from alpasim_plugin.core.files.limits import Bound
 from alpasim_plugin.core.types import F64, Actor, Bool, Vehicle
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph
 
-JUMP = (
-    12.0  # a step so many times the usual one is no driving: two units, or two drives in one file
-)
+# A step so many times the usual one is no driving: two units, or two drives in one file.
+JUMP = 12.0
 LEAST_M = 1.0
 UNITS = 30.0  # steps change by so much, at once and for good, between metres and centimetres
 PHOTOGRAPHS = Bound("photographs with poses", "", 8, 400, "give a drive, or a part of a long one")
@@ -137,14 +136,14 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
     photographs = drive.of(drive.front)
     camera = f"{folder}, camera {drive.front!r}"
     PHOTOGRAPHS.check(len(photographs), camera)
-    for one in drive.photographs:
+    for photograph in drive.photographs:
         if need_files:
-            one.encoded()
-        size = (one.lens.width, one.lens.height)
-        first = drive.of(str(one.camera))[0].lens
+            photograph.encoded()
+        size = (photograph.lens.width, photograph.lens.height)
+        first = drive.of(str(photograph.camera))[0].lens
         if size != (first.width, first.height):
             raise InputError(
-                f"{one.where}, {one.file}: {size} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
+                f"{photograph.where}, {photograph.file}: {size} pixels, others of the camera {photograph.camera!r} have {first.width}x{first.height}",
                 "give the photographs as they were, each with its camera's name",
             )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
@@ -157,8 +156,8 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
     usual = float(np.median(steps[steps > 0]))
     far = int(np.argmax(steps))
     if steps[far] > JUMP * usual and steps[far] > 0.2 * length:
-        found = f"a step of {steps[far]:.4g}, where the usual step is {usual:.4g}"
-        raise _two_units(photographs[far + 1], found)
+        fault = f"a step of {steps[far]:.4g}, where the usual step is {usual:.4g}"
+        raise _two_units(photographs[far + 1], fault)
     medians = np.median(np.lib.stride_tricks.sliding_window_view(steps, 5), axis=1)
     before = medians[:-5]
     after = medians[5:]
@@ -166,24 +165,25 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
         (np.maximum(before, after) > UNITS * np.minimum(before, after)) & (before * after > 0)
     )
     if len(changes):
-        found = f"steps more than {UNITS:.0f} times as long, or as short, from here on"
-        raise _two_units(photographs[int(changes[0]) + 6], found)
+        fault = f"steps more than {UNITS:.0f} times as long, or as short, from here on"
+        raise _two_units(photographs[int(changes[0]) + 6], fault)
     first_us = int(photographs[0].t_us or 0)
-    tracks = [replace(one.track, t_us=one.track.t_us - first_us) for one in drive.actors]
+    tracks = [replace(actor.track, t_us=actor.track.t_us - first_us) for actor in drive.actors]
     return replace(
         drive,
         photographs=tuple(
-            replace(one, t_us=int(one.t_us or 0) - first_us) for one in drive.photographs
+            replace(photograph, t_us=int(photograph.t_us or 0) - first_us)
+            for photograph in drive.photographs
         ),
         actors=tuple(
-            replace(one, track=track) for one, track in zip(drive.actors, tracks, strict=True)
+            replace(actor, track=track) for actor, track in zip(drive.actors, tracks, strict=True)
         ),
     )
 
 
-def _two_units(one: PosedPhotograph, found: str) -> InputError:
+def _two_units(photograph: PosedPhotograph, fault: str) -> InputError:
     return InputError(
-        f"{one.where}, {one.file.name}: {found}",
+        f"{photograph.where}, {photograph.file.name}: {fault}",
         "give all poses in one unit, metres, and one drive at a time",
     )
 
@@ -200,11 +200,14 @@ def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]
     Raises:
         InputError: Nothing says which photographs of the cameras belong together.
     """
-    numbers = [name_numbers([one.file for one in camera]) for camera in cameras]
-    every = sorted({number for column in numbers for number in column})
-    steps = sorted(after - before for before, after in pairwise(every))
+    numbers = [name_numbers([photograph.file for photograph in camera]) for camera in cameras]
+    all_numbers = sorted({number for column in numbers for number in column})
+    steps = sorted(after - before for before, after in pairwise(all_numbers))
     step = steps[len(steps) // 2] if steps else 1
-    if not set.intersection(*map(set, numbers)) or every[-1] - every[0] > LONGEST * step:
+    if (
+        not set.intersection(*map(set, numbers))
+        or all_numbers[-1] - all_numbers[0] > LONGEST * step
+    ):
         counts = [len(camera) for camera in cameras]
         if len(set(counts)) > 1:
             raise InputError(
@@ -212,12 +215,12 @@ def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]
                 "give each photograph its time (t_us), or photographs of one time names of one number",
             )
         numbers = [list(range(count)) for count in counts]
-        every = numbers[0]
+        all_numbers = numbers[0]
         step = 1
     return [
-        replace(one, t_us=round((number - every[0]) * PERIOD_US / step))
+        replace(photograph, t_us=round((number - all_numbers[0]) * PERIOD_US / step))
         for camera, column in zip(cameras, numbers, strict=True)
-        for one, number in zip(camera, column, strict=True)
+        for photograph, number in zip(camera, column, strict=True)
     ]
 
 
@@ -239,7 +242,7 @@ def in_order(photographs: Sequence[PosedPhotograph]) -> tuple[list[PosedPhotogra
     The order is that of the file. Some tools list photographs in an order of their own: where the
     path along the names, in natural order, is shorter, the names count.
     """
-    by_name = sorted(photographs, key=lambda one: natural_order(one.file.as_posix()))
+    by_name = sorted(photographs, key=lambda photograph: natural_order(photograph.file.as_posix()))
     listed = _length(photographs)
     named = _length(by_name)
     name = photographs[0].camera

@@ -18,7 +18,7 @@ from alpasim_plugin.drives.build import (
     begin,
     enter,
     finished,
-    shown_photographs,
+    placed_photographs,
     working_folder,
     write_folder,
     write_photographs,
@@ -41,14 +41,17 @@ from scenarios.map_lines import corridor
 OPAQUE = 0.3  # opacity from which a Gaussian counts as surface
 MAX_POINTS = 100_000  # of them, in which the ground is looked for
 SPREAD = 0.5  # of a Gaussian's centre around the surface, in its own mean size
-NEAR_M, MIN_POINTS = 2.5, 5  # a pose is on the road if so many points are so near to it
+# A pose is on the road if so many points are so near to it.
+NEAR_M = 2.5
+MIN_POINTS = 5
 MIN_ON_ROAD = 0.5  # share of the poses
 ROADSIDE_M = 15.0  # from the path, where objects stand on the ground
 CLEARLY_M = 0.5  # above the ground, or below it
 VIEW_PX = 320  # width of the views of a model without photographs
 TRAINED = "dataparser_transforms.json"  # of nerfstudio
 SWAPPED = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))  # applied before it was stated
-VIEWS, OPAQUE_PIXEL = 8, 0.5  # that coverage is measured on
+VIEWS = 8  # that coverage is measured on
+OPAQUE_PIXEL = 0.5  # opacity from which the model covers a pixel
 LEAST_COVERED = 0.3  # of the lower half of the images
 MOST_ROLL_DEG = 20.0  # of the camera against the ground
 
@@ -106,17 +109,17 @@ def import_splat(
         sky = Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))
         model = Reconstruction(placed_cloud(cloud, placed.T_world_source), {}, sky)
         begin(work, key)
-        every = EVERY if placed.strip else EVERY_STILL
-        shown = shown_photographs(drive, placed, every) if has_photographs else []
-        write_photographs(work, shown, tell)
+        stride = EVERY if placed.strip else EVERY_STILL
+        photographs = placed_photographs(drive, placed, stride) if has_photographs else []
+        write_photographs(work, photographs, tell)
         views = {
-            use: [photograph.view() for photograph in shown if photograph.use == use]
+            use: [photograph.view() for photograph in photographs if photograph.use == use]
             for use in ("fitted", "held-out", "never-fitted")
         }
         if not has_photographs:
             views["fitted"] = _blank_views(drive, placed)
         roads = corridor(placed.ego, placed.ground)
-        return write_folder(work, drive, placed, roads, model, shown, views, {}, tell)
+        return write_folder(work, drive, placed, roads, model, photographs, views, {}, tell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +186,8 @@ def _in_frame(
     moved = models[best]
     notes: tuple[str, ...] = ()
     if stated is not None:
-        seen = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
-        notes = (f"the model is taken {best}: from the poses it covers {seen}",)
+        coverage = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
+        notes = (f"the model is taken {best}: from the poses it covers {coverage}",)
     if covered < LEAST_COVERED:
         raise InputError(
             f"{file}: from the poses it covers {100 * covered:.1f} % of the images' lower half, less than {100 * LEAST_COVERED:.0f} %",

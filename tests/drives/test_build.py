@@ -104,9 +104,9 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(w
         replace(drive, metric=None), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     )
     assert placed.strip is None
-    _, _, every = measured(lambda every: (drive, placed))
-    shown = build.shown_photographs(drive, placed, every)
-    assert sum(one.use == "held-out" for one in shown) == 5
+    _, _, stride = measured(lambda stride: (drive, placed))
+    photographs = build.placed_photographs(drive, placed, stride)
+    assert sum(photograph.use == "held-out" for photograph in photographs) == 5
     assert "photographs taken along a road" in str(placed.notes)
 
 
