@@ -95,9 +95,8 @@ class Cell:
     score_key: str  # digest of rollout_key and of everything that determines the scores
     # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
     stops_at_path_end: bool = True
-    undigested: tuple[
-        str, ...
-    ] = ()  # parts without a digest (remote services): the rollout is reused on request only
+    # parts without a digest (remote services): the rollout is reused on request only
+    undigested: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:

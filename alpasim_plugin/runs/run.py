@@ -271,7 +271,8 @@ def finish_run(
         report: Write ``report.html``.
     """
     info = read_run_json(root) | dict(more)
-    info["outcome"] = {  # for lists of many runs
+    # for lists of many runs
+    info["outcome"] = {
         "n_rollouts": len(manifests),
         "n_failed": sum(manifest["status"] != "ok" for manifest in manifests),
     }

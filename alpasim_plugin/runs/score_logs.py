@@ -141,9 +141,8 @@ def _score(
         rollout = read_asl(log)
     except InputError as error:
         return _failed(manifest, error, root, taken)
-    session = (
-        rollout.session_uuid or name
-    )  # as in AlpaSim; a second log with that id gets its folder's name with it
+    # as in AlpaSim; a second log with that id gets its folder's name with it
+    session = rollout.session_uuid or name
     session = session if session not in names else f"{session} ({name})"
     names.add(session)
     versions = rollout.info["versions"]

@@ -286,9 +286,8 @@ class CommandPolicy(DriverPolicy):
     def _call(self, method: str, request: Any) -> Any:
         try:
             return super()._call(method, request)
-        except (
-            SimrunError
-        ) as error:  # a connection is lost, too, where the command has ended: that is its own fault
+        # a connection is lost, too, where the command has ended: that is its own fault
+        except SimrunError as error:
             self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
             if "DEADLINE_EXCEEDED" in error.message:  # it hangs: the next rollout gets a new one
                 self._served.stop()

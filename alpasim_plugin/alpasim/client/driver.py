@@ -48,9 +48,8 @@ from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
-_SESSIONS = (
-    itertools.count()
-)  # sessions of several rollouts of one scene and seed may be open at one driver
+# sessions of several rollouts of one scene and seed may be open at one driver
+_SESSIONS = itertools.count()
 
 
 class DriverPolicy(Policy):
@@ -225,9 +224,8 @@ class DriverPolicy(Policy):
             if len(sample) and int(sample.t_us[-1]) >= int(times[-1]):
                 samples.append(in_rig(sample, observation, times)[1])
             else:
-                self._facts["samples_cut"] += (
-                    1  # a sample that ends before the plan has no place at the plan's last times
-                )
+                # a sample that ends before the plan has no place at the plan's last times
+                self._facts["samples_cut"] += 1
         return Plan(now, times, rows[:, :2], rows[:, 2], tuple(samples))
 
     def _read(self, message: common_pb2.Trajectory, what: str) -> Trajectory:

@@ -35,12 +35,10 @@ from alpasim_plugin.core.geometry import rigid
 from alpasim_plugin.core.types import F64
 
 SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
-ACCEL_MPS2 = (
-    10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking
-)
-SPEED_MPS = (
-    70.0  # where there is no motion to continue, farther than this times dt is another place
-)
+# ... plus this times dt^2: twice the error of a constant speed under hard braking
+ACCEL_MPS2 = 10.0
+# where there is no motion to continue, farther than this times dt is another place
+SPEED_MPS = 70.0
 LEVER_M = 2.0  # a turn by one radian counts as this distance
 S = TypeVar("S")
 GAP_US = 2_000_000  # longest time between two frames of a drive
@@ -148,9 +146,8 @@ class HistoryTree(Generic[S]):
         self.bytes = 0
         self.counts = Counts()
         self._nodes: OrderedDict[bytes, Node[S]] = OrderedDict()  # the longest unused first
-        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(
-            list
-        )  # sorted by time
+        # sorted by time
+        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(list)
         self._lock = threading.Lock()
 
     def __len__(self) -> int:

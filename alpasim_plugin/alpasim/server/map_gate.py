@@ -89,9 +89,8 @@ def contradiction(
 
     def agreement_at(offset_m: float) -> float | None:
         T = T_world_camera.copy()
-        T[:3, 3] -= offset_m * leftwards(
-            T_world_camera
-        )  # who stands to the right sees the lines to the left
+        # who stands to the right sees the lines to the left
+        T[:3, 3] -= offset_m * leftwards(T_world_camera)
         return agreement(
             pieces_of(line_pixels(draw_map(scene_map, small, T)) & open_road),
             markings,

@@ -352,9 +352,8 @@ def points_of(
     for index, (camera, depth, image) in enumerate(zip(cameras, depths, images, strict=True)):
         mine = rays[nearest == index]
         p = mine @ camera.T_rig_camera[:3, :3]
-        u, v = (
-            camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1)
-        )  # pixel centres lie at halves
+        # pixel centres lie at halves
+        u, v = (camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1))
         column, row = (
             np.clip(np.floor(x).astype(np.int64), 0, n - 2)
             for x, n in ((u, camera.width), (v, camera.height))

@@ -44,10 +44,8 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.log.wire import sensorsim_pb2
 
-NEAR_M, FAR_M = (
-    0.25,
-    3.0,
-)  # distance from the recorded path where trust begins to fall, and where it has fallen
+# distance from the recorded path where trust begins to fall, and where it has fallen
+NEAR_M, FAR_M = (0.25, 3.0)
 FAR = 0.6  # above 0.5: a hole is never invented
 MAP_OFF = "map-off"
 log = logging.getLogger("simrun.serve")
@@ -422,9 +420,8 @@ class UpstreamSource:
                 self._mounts[view.scene_id, camera.logical_id] = read_transform(
                     camera.rig_to_camera, f"mount of {camera.logical_id!r}"
                 )
-            self._mounts.setdefault(
-                key, np.eye(4)
-            )  # a camera of the runtime's own: its place counts instead of the rig's
+            # a camera of the runtime's own: its place counts instead of the rig's
+            self._mounts.setdefault(key, np.eye(4))
         return self._mounts[key]
 
 
