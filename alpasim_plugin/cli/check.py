@@ -176,7 +176,9 @@ def check_driver(
             measured = {name: values[name] for name in OUTCOMES if name in values}
             ended[scene.scene_id] = in_words(
                 tuple(
-                    name for name, one in measured.items() if one["valid"] and one["value"] >= 0.5
+                    name
+                    for name, entry in measured.items()
+                    if entry["valid"] and entry["value"] >= 0.5
                 )
             )
         except (PolicyError, InfrastructureError) as error:

@@ -55,7 +55,7 @@ def compare(
     baseline: Annotated[
         str | None, Flag("RENDERER, POLICY or RENDERER/POLICY to compare with.")
     ] = None,
-    every: Annotated[
+    all_metrics: Annotated[
         bool, Flag("Print every metric, not only the headline ones.", "--all")
     ] = False,
     as_json: Json = False,
@@ -83,17 +83,19 @@ def compare(
             metrics=joined_metrics(folders),
         )
         whole = [rollout for run in opened for rollout in run.rollouts]
-        asked = list(dict.fromkeys(name for run in opened for name in run.info.get("asked") or ()))
-        info = {**opened[0].info, "asked": asked}
+        scenario_names = list(
+            dict.fromkeys(name for run in opened for name in run.info.get("asked") or ())
+        )
+        info = {**opened[0].info, "asked": scenario_names}
         info["scenes"] = {
             name: facts for run in opened for name, facts in run.info["scenes"].items()
         }
         means = _with_endings(joined, opened, whole)
-        shown = replace(opened[0], summary=means, rollouts=whole, info=info)
+        overview_run = replace(opened[0], summary=means, rollouts=whole, info=info)
     else:
         result = compare_within(opened[0], baseline, EVERY_MISSING)
         means = opened[0].summary
-        shown = opened[0]
+        overview_run = opened[0]
     facts: dict[str, Any] = {
         "runs": [str(run) for run in folders],
         "notes": list(result.notes),
@@ -106,31 +108,34 @@ def compare(
             "metrics": _tables_as_json(means.metrics),
             "failures": to_json(means.failures),
         }
-        lines += first_screen(shown)
-        if every:
+        lines += first_screen(overview_run)
+        if all_metrics:
             lines += metric_lines(means, known=result.metrics)
         failures = means.failures
         if failures.n_failed:
             causes = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())
             number = f"{failures.n_failed} of {failures.n_rollouts}"
             lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
-    said = [f"note: {note}" for note in result.notes]
+    pair_lines = [f"note: {note}" for note in result.notes]
     for tables in (result.paired, result.paired_with_base, result.paired_policies):
         for variant, entries in tables.items():
             baseline = next((entry.baseline for entry in entries.values()), "nothing")
-            said += ["", f"{variant} minus {baseline}"]
+            pair_lines += ["", f"{variant} minus {baseline}"]
             rows = [
                 row
                 for row in pair_rows([(variant, entries)], result.metrics)
-                if entries[row.metric].n_cells and (every or row.metric in result.metrics.headline)
+                if entries[row.metric].n_cells
+                and (all_metrics or row.metric in result.metrics.headline)
             ]
-            said += _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
-            missing = _missing(entries, len(entries) if every else SHOWN)
-            said += missing if every else missing[:SHOWN]
-            if len(missing) > SHOWN and not every:
-                said.append(f"  {len(missing) - SHOWN} more lines: --all")
+            pair_lines += (
+                _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
+            )
+            missing = _missing(entries, len(entries) if all_metrics else SHOWN)
+            pair_lines += missing if all_metrics else missing[:SHOWN]
+            if len(missing) > SHOWN and not all_metrics:
+                pair_lines.append(f"  {len(missing) - SHOWN} more lines: --all")
     width = terminal_width()
-    for line in said:
+    for line in pair_lines:
         lines += wrap(line, width, subsequent_indent=INDENT, break_on_hyphens=False) or [""]
     show(as_json, facts, *lines)
 
@@ -165,7 +170,7 @@ def _with_endings(joined: Summary, runs: Sequence[Run], rollouts: Sequence[Rollo
 
 
 def _table(
-    rows: Sequence[PairRow], entries: Mapping[str, Difference], known: MetricTable
+    rows: Sequence[PairRow], entries: Mapping[str, Difference], metric_table: MetricTable
 ) -> list[str]:
     """Return one line per metric."""
     lines = [("metric", "difference", "p", "these scenes", "95 %", "margin", "pairs", "others")]
@@ -174,7 +179,7 @@ def _table(
         verdict: str = entry.verdict
         if entry.more_scenes:
             verdict += f", at least {entry.more_scenes} more scenes"
-        scale = 100.0 if known.shown(row.metric).in_percent else 1.0
+        scale = 100.0 if metric_table.shown(row.metric).in_percent else 1.0
         margin = f"{scale * entry.margin:g}"
         pairs = f"{entry.n_cells} in {plural(entry.n_scenes, 'scene')}"
         contrast = entry.difference or NONE_SHOWN

@@ -15,10 +15,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_text
 from alpasim_plugin.core.flags import Positional
 
+# of a checkout, of the wheel
 FOLDERS = (
     Path(__file__).resolve().parents[2] / "docs",
     Path(sys.prefix, "share", "simrun", "docs"),
-)  # of a checkout, of the wheel
+)
 EPILOG = """
 Examples:
 

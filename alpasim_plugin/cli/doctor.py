@@ -35,13 +35,13 @@ def doctor(
 
         device = require_device("cuda")
         sections = {}
-        for section, found in check_gpu(device, budget_s):
-            sections[section] = found
+        for section, facts in check_gpu(device, budget_s):
+            sections[section] = facts
             if not as_json:
-                show(False, found, f"{section:>12}  {json.dumps(found)}")
+                show(False, facts, f"{section:>12}  {json.dumps(facts)}")
         if as_json:
             show(True, {"device": device, "sections": sections})
-        raise typer.Exit(0 if all(found["ok"] for found in sections.values()) else 4)
+        raise typer.Exit(0 if all(section["ok"] for section in sections.values()) else 4)
     rows = []
     for name, check in CHECKS.items():
         row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}

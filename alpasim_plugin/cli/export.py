@@ -97,21 +97,23 @@ def _export_to_alpasim(items: Sequence[str], folder: Path, as_json: bool) -> Non
     else:
         done = export_scenes(items, folder)
     lines = []
-    for one in done.runs:
-        failed = f", {one.failed} failed" if one.failed else ""
-        lines.append(f"run     {done.root / one.folder}  {one.rollouts} rollouts{failed}")
+    for exported_run in done.runs:
+        failed = f", {exported_run.failed} failed" if exported_run.failed else ""
+        lines.append(
+            f"run     {done.root / exported_run.folder}  {exported_run.rollouts} rollouts{failed}"
+        )
     lines += [f"scene   {done.root / scene}" for scene in done.scenes]
-    exported = [vars(one) for one in done.runs]
+    exported = [vars(exported_run) for exported_run in done.runs]
     facts = {"out": str(done.root), "runs": exported, "scenes": list(done.scenes)}
     show(as_json, facts, *lines)
 
 
-def export_recording(items: Sequence[str], asked: Wanted, path: Path) -> dict[str, Any]:
+def export_recording(items: Sequence[str], selection: Wanted, path: Path) -> dict[str, Any]:
     """Write an MCAP recording of one scene, policy and seed.
 
     Args:
         items: The run folder or the rollout's folder; one.
-        asked: Which scene, policy and seed of a run, and which renderers.
+        selection: Which scene, policy and seed of a run, and which renderers.
         path: The file.
 
     Returns:
@@ -133,7 +135,7 @@ def export_recording(items: Sequence[str], asked: Wanted, path: Path) -> dict[st
     if os.path.exists(root / SUMMARY):
         ensure_tables(root, warn)
     run = Run.read_so_far(root)
-    wanted = cells_wanted(run.rollouts, cell, asked)
+    wanted = cells_wanted(run.rollouts, cell, selection)
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
     if len(cells) != 1:

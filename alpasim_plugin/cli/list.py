@@ -51,32 +51,36 @@ def list_names(
     if roots or renderer or policy or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
     if kind is None:
-        known = {name: f"simrun list {name}" for name in get_args(Kind)}
+        descriptions = {name: f"simrun list {name}" for name in get_args(Kind)}
     elif kind == "renderers":
-        known = names("renderer")
+        descriptions = names("renderer")
         for name, text in names("fixer").items():
-            known[name] = f"3dgs, repaired by the fixer {name}: {text}"
+            descriptions[name] = f"3dgs, repaired by the fixer {name}: {text}"
     elif kind == "fixers":
-        known = {}
+        descriptions = {}
         for fixer, help_text in names("fixer").items():
             spec = unidentified("fixer", fixer)
             factory = load(spec.target, "fixer")
             help_text = getattr(factory, "help", {}).get(fixer, help_text)
-            known[fixer] = f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
+            descriptions[fixer] = (
+                f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
+            )
     elif kind == "policies":
-        known = names("policy")
+        descriptions = names("policy")
     elif kind == "scenarios":
         from scenarios.suite import shipped
 
-        known = shipped()
+        descriptions = shipped()
     elif kind == "metrics":
         from evaluators.metrics import table_of
         from evaluators.metrics.score import resolve_plugins
 
-        known = {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
+        descriptions = {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
     else:
         from evaluators.metrics.presets import described
 
-        known = described()
-    width = max((len(name) for name in known), default=0)
-    show(as_json, known, *(f"{name:<{width}}  {text}" for name, text in known.items()))
+        descriptions = described()
+    width = max((len(name) for name in descriptions), default=0)
+    show(
+        as_json, descriptions, *(f"{name:<{width}}  {text}" for name, text in descriptions.items())
+    )

@@ -143,12 +143,12 @@ def verbs() -> dict[str, str]:
     Raises:
         InputError: A package claims a name that is taken.
     """
-    own = {
+    own_verbs = {
         verb: f"alpasim_plugin.cli.{target}"
         for panel in PANELS.values()
         for verb, (target, _) in panel.items()
     }
-    return own | installed_names(PLUGIN_GROUP, own)
+    return own_verbs | installed_names(PLUGIN_GROUP, own_verbs)
 
 
 class Verb(TyperCommand):
@@ -160,9 +160,9 @@ class Verb(TyperCommand):
         # Of an option that takes one value and stands twice, the last would win.
         options = [one for one in command.params if isinstance(one, TyperOption)]
         for option in options:
-            given = [word for word in args if word.partition("=")[0] in option.opts]
-            if len(given) > 1 and not option.multiple and not option.is_flag:
-                raise InputError(f"{given[0]}: given {len(given)} times", "Give it once.")
+            words = [word for word in args if word.partition("=")[0] in option.opts]
+            if len(words) > 1 and not option.multiple and not option.is_flag:
+                raise InputError(f"{words[0]}: given {len(words)} times", "Give it once.")
         return command.make_context(info_name, args, parent, **extra)
 
 
@@ -315,10 +315,10 @@ def _run(args: list[str]) -> int:
             from alpasim_plugin.core.files.reading import wanted_of
 
             problem = errors()[0]
-            found = f"{problem['input']!r}, wanted {wanted_of(problem)}"
+            detail = f"{problem['input']!r}, wanted {wanted_of(problem)}"
             if problem["type"] == "value_error":  # a choice, whose error says all of it
-                found = str(problem["ctx"]["error"])
-            message = message.replace(error.message, found)
+                detail = str(problem["ctx"]["error"])
+            message = message.replace(error.message, detail)
         refused_by = getattr(error, "ctx", None)  # errors of options have one
         verb = refused_by.command_path if refused_by else "simrun"
         raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error

@@ -60,10 +60,10 @@ def command_of(verb: Callable[..., None]) -> Callable[..., None]:
     if "debug" not in hints:
         options.append(_option("debug", Debug, False))
 
-    def call(**given: Any) -> None:
+    def call(**arguments: Any) -> None:
         values = {
             name: tuple(value) if isinstance(value, list) else value
-            for name, value in given.items()
+            for name, value in arguments.items()
         }
         for name, (kind, names) in dataclasses.items():
             values[name] = kind(**{field: values.pop(field) for field in names})
@@ -151,16 +151,18 @@ def _completion(kind: str) -> Callable[[str], list[str]]:
         from scenarios.suite import shipped_names, suites
 
         if kind == "preset":
-            known = [*PRESETS]
+            candidates = [*PRESETS]
         elif kind == "scenario":
-            known = [*shipped_names(), *suites()]
+            candidates = [*shipped_names(), *suites()]
         elif kind == "renderer":
-            known = [*names("renderer"), *names("fixer")]
+            candidates = [*names("renderer"), *names("fixer")]
         else:
-            known = [*names(kind)]  # type: ignore[arg-type]  # the kinds of parts
+            candidates = [*names(kind)]  # type: ignore[arg-type]  # the kinds of parts
         before, comma, last = incomplete.rpartition(",")
         return [
-            before + comma + name for name in known if name.startswith(last) and ":" not in name
+            before + comma + name
+            for name in candidates
+            if name.startswith(last) and ":" not in name
         ]
 
     return offer
@@ -188,10 +190,10 @@ def split_overrides(overrides: Sequence[str]) -> tuple[tuple[str, ...], tuple[st
     of_scene = []
     of_fixer = []
     for text in overrides:
-        label, rest = split_label(text)
-        if rest.startswith(FIXER_PREFIX):
-            own = rest.removeprefix(FIXER_PREFIX)
-            of_fixer.append(f"{label}:{own}" if label else own)
+        label, setting = split_label(text)
+        if setting.startswith(FIXER_PREFIX):
+            fixer_setting = setting.removeprefix(FIXER_PREFIX)
+            of_fixer.append(f"{label}:{fixer_setting}" if label else fixer_setting)
         else:
             of_scene.append(text)
     return tuple(of_scene), tuple(of_fixer)

@@ -197,13 +197,13 @@ def size_lines(plan: RunPlan) -> list[str]:
     pixels = pixels_of(largest)
     if pixels < LARGE_PX:
         return []
-    pinholes, drawn = drawn_pixels(largest.cameras)
+    pinholes, pinhole_px = drawn_pixels(largest.cameras)
     cameras = plural(len(largest.cameras), "camera")
     size = f"{cameras} of {pixels / 1e6:.1f} megapixels"
-    by = f"drawn as {drawn / 1e6:.1f} by {plural(pinholes, 'pinhole')}"
-    cost = f"{drawn / PX_PER_S:.1f} CPU seconds"
+    by = f"drawn as {pinhole_px / 1e6:.1f} by {plural(pinholes, 'pinhole')}"
+    cost = f"{pinhole_px / PX_PER_S:.1f} CPU seconds"
     if largest.background is None and largest.model is None:
-        cost += f" and {memory_mb(largest, drawn) / 1e3:.1f} GB"
+        cost += f" and {memory_mb(largest, pinhole_px) / 1e3:.1f} GB"
     line = f"{largest.scene_id}: {size}, {by}, {cost} behind clean"
     fit_min = fit_cpu_s(largest, pinholes) / 60
     if fit_min and any(spec.base.name == "3dgs" for spec in plan.renderers):
@@ -228,8 +228,8 @@ def varied_lines(plan: RunPlan) -> list[str]:
         changes = varied_numbers(scenario.varied)
         if changes:
             more = f", and {len(changes) - SHOWN_CHANGES} more" * (len(changes) > SHOWN_CHANGES)
-            shown = ", ".join(changes[:SHOWN_CHANGES])
-            lines.append(f"{name}: scene seed {scenario.seed} varies {shown}{more}")
+            excerpt = ", ".join(changes[:SHOWN_CHANGES])
+            lines.append(f"{name}: scene seed {scenario.seed} varies {excerpt}{more}")
     hidden = len(lines) - SHOWN_SCENES
     if hidden > 0:
         more_scenes = plural(hidden, "more scene")

@@ -30,7 +30,11 @@ MARGIN_M = 15.0
 SIZE = (13.0, 7.0)  # inches
 SHOWN_CHANGES = 6
 SHOWN_NOTES = 4
-ROAD, MARKING, CROSSWALK, EDGE, EGO = "#d7dadd", "#ffffff", "#c3c8cd", "#7d858c", "#0b6bb3"
+ROAD = "#d7dadd"
+MARKING = "#ffffff"
+CROSSWALK = "#c3c8cd"
+EDGE = "#7d858c"
+EGO = "#0b6bb3"
 OTHERS = ("#c2540a", "#00806a", "#9a4f8f", "#8a6a00", "#b3344a", "#3f51b5", "#5b6470")
 
 
@@ -99,8 +103,8 @@ def _facts(scenario: Scenario, actors: Sequence[Actor]) -> list[str]:
     changes = varied_numbers(scenario.varied)
     if changes:
         more = " and more" if len(changes) > SHOWN_CHANGES else ""
-        shown = ", ".join(changes[:SHOWN_CHANGES])
-        facts.append(f"scene seed {scenario.seed} varies {shown}{more}")
+        excerpt = ", ".join(changes[:SHOWN_CHANGES])
+        facts.append(f"scene seed {scenario.seed} varies {excerpt}{more}")
     background = background_note(scenario)
     if background:
         facts.append(background)

@@ -176,17 +176,7 @@ def run(
     ends = {"from": start, "to": goal}
     route = [f"map.route.{key}={place}" for key, place in ends.items() if place is not None]
     of_scene, of_fixer = split_overrides((*overrides, *route))
-    listed: dict[tuple[ScenarioRef, ...], str] = {}
-    for item in scenarios:
-        found = tuple(expand(item, of_scene, source))
-        if found in listed:
-            raise InputError(
-                f"scenarios {listed[found]} and {item}: they are the same",
-                "Name every scenario once.",
-            )
-        listed[found] = item
-    # What two suites list is one scene, before shards are cut: or two shards would drive it.
-    refs = list(dict.fromkeys(chain.from_iterable(listed)))
+    refs = _scenes(scenarios, of_scene, source)
     if shard is not None:
         refs = shard_of(refs, shard)
     planned = partial(
@@ -202,7 +192,7 @@ def run(
             f"--vary {vary[0]}: takes one scene, and no --until-decided, --repeat or --resume",
             "Name one scene and leave these options out.",
         )
-    plan = replace(planned(refs), asked=scenarios)
+    plan = replace(planned(refs), scenario_names=scenarios)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
@@ -270,6 +260,34 @@ def run(
     raise typer.Exit(result.exit_code)
 
 
+def _scenes(
+    scenarios: Sequence[str], overrides: Sequence[str], source: str | None
+) -> list[ScenarioRef]:
+    """Return the scenes that a command names, each once.
+
+    A scene that two suites list is made one here, before shards are cut: otherwise two shards would
+    drive it.
+
+    Args:
+        scenarios: Scenarios, suites, folders, shipped names or recorded logs.
+        overrides: ``KEY=VALUE`` of the scenarios.
+        source: Reader of recorded logs.
+
+    Raises:
+        InputError: Two names stand for the same scenes.
+    """
+    name_by_refs: dict[tuple[ScenarioRef, ...], str] = {}
+    for name in scenarios:
+        refs = tuple(expand(name, overrides, source))
+        if refs in name_by_refs:
+            raise InputError(
+                f"scenarios {name_by_refs[refs]} and {name}: they are the same",
+                "Name every scenario once.",
+            )
+        name_by_refs[refs] = name
+    return list(dict.fromkeys(chain.from_iterable(name_by_refs)))
+
+
 def shard_of(refs: Sequence[ScenarioRef], shard: str) -> list[ScenarioRef]:
     """Return every N-th scene, from the I-th on, for a shard ``I/N``.
 
@@ -296,12 +314,12 @@ def question_of(metrics: Sequence[str]) -> Question:
     """
     if not metrics:
         spec, _ = load_gate("default")
-        asked = tuple(
+        criteria = tuple(
             metric_question(name, rule.margin, rule.must_decide)
             for name, rule in spec.metrics.items()
             if rule.margin is not None
         )
-        return Question(asked)
+        return Question(criteria)
     questions = {}
     for text in metrics:
         name, _, margin = text.partition("=")
@@ -326,7 +344,7 @@ def _print_decision(test: SequentialTest, root: Path, as_json: bool) -> None:
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
     with parts_print_to_stderr():
-        asked = [frames_asked(policy, plan.scenarios.values()) for policy in plan.policies]
+        frame_counts = [frames_asked(policy, plan.scenarios.values()) for policy in plan.policies]
     facts = {
         "out": str(root),
         "key": plan.command_key,
@@ -339,13 +357,13 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
         "varied": {name: s.varied for name, s in plan.scenarios.items() if s.varied},
         "never_reused": list(plan.undigested),
         "large_cameras": size_lines(plan),
-        "camera_frames": sum(asked) * len(plan.renderers) * len(plan.seeds),
+        "camera_frames": sum(frame_counts) * len(plan.renderers) * len(plan.seeds),
         "workers": threads.workers,
         "threads_per_worker": threads.per_worker,
     }
-    shown = facts | {"varied": varied_lines(plan), "backgrounds": background_lines(plan)}
+    text_facts = facts | {"varied": varied_lines(plan), "backgrounds": background_lines(plan)}
     lines = []
-    for key, value in shown.items():
+    for key, value in text_facts.items():
         text = ", ".join(map(str, value)) or "-" if isinstance(value, list) else value
         lines.append(f"{key:>18}  {text}")
     show(as_json, facts, *lines)

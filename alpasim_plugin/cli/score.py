@@ -64,21 +64,21 @@ def score(
     names = list(dict.fromkeys(part.strip() for part in preset.split(",")))
     chosen = {name: find_preset(name) for name in names}
     own_settings = {
-        name: _settings(one, settings if len(names) == 1 or one.aliases else None)
-        for name, one in chosen.items()
+        name: _settings(choice, settings if len(names) == 1 or choice.aliases else None)
+        for name, choice in chosen.items()
     }
     paths = find_logs(logs)
     parts = resolve_evaluators(evaluators)
     results: dict[str, ScoreResult] = {}
     with Progress(as_json) as progress:
-        for name, one in chosen.items():
-            own = own_settings[name]
+        for name, choice in chosen.items():
+            preset_settings = own_settings[name]
             progress.add_task(name, total=len(paths))
             results[name] = execute_score(
                 paths,
                 KnownScenes(scene),
-                one if own is None else own.preset(one),
-                own,
+                choice if preset_settings is None else preset_settings.preset(choice),
+                preset_settings,
                 parts,
                 out if out is None or len(names) == 1 else out / name,
                 ["simrun", *sys.argv[1:]],
@@ -95,8 +95,8 @@ def score(
         if len(names) == 1 and any(rollout.ok for rollout in run.rollouts):
             lines += first_screen(run)
         lines += report_lines(result.root)
-    if len(names) > 1 or any(one.protocol for one in chosen.values()):
-        lines.append(render_presets({name: one.summary for name, one in results.items()}))
+    if len(names) > 1 or any(choice.protocol for choice in chosen.values()):
+        lines.append(render_presets({name: choice.summary for name, choice in results.items()}))
     for result in () if as_json else results.values():
         for cell in result.summary.failures.cells[:SHOWN_FAILURES]:
             warn(*error_lines(to_json(cell.error)))

@@ -157,7 +157,9 @@ def _serve_policy(
     service = DriverService(
         spec.name, spec.digest, make, finder, host_policy.expiry_s, budget=budget
     )
-    host = Host({"EgodriverService": service}, listen, host_policy, every=service.sessions.expire)
+    host = Host(
+        {"EgodriverService": service}, listen, host_policy, on_interval=service.sessions.expire
+    )
     facts = {"serving": "EgodriverService", "at": host.address, "policy": policy}
     text = f"serving EgodriverService at {host.address}: {policy}"
     _host(host, facts, text, host_policy, as_json)

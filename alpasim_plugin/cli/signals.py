@@ -28,8 +28,8 @@ def stoppable() -> Iterator[None]:
         return
 
     def stop(number: int, frame: FrameType | None) -> None:
-        for one in before:
-            signal.signal(one, _leave)
+        for handled in before:
+            signal.signal(handled, _leave)
         raise Stopped(number)
 
     before = {

@@ -49,8 +49,8 @@ Exit codes: 0 the page is written; 2 no such run, rollout or scenario; 4 the dis
 
 
 def view(
-    asked: Wanted,
-    what: Annotated[
+    selection: Wanted,
+    target: Annotated[
         str | None,
         Positional(
             "A run, a rollout or a scenario.",
@@ -70,9 +70,9 @@ def view(
     a scenario shows its map, road users over time, and the camera along the recorded path.
     """
     refuse_existing(out, "--out")
-    path = run_or_newest(None) if what is None else Path(what)
+    path = run_or_newest(None) if target is None else Path(target)
     if not any(os.path.exists(folder / RUN_INFO) for folder in (path, *path.parents)):
-        _view_scenario(str(what), asked, overrides, out, as_json)
+        _view_scenario(str(target), selection, overrides, out, as_json)
         return
     root, cell = run_and_cell(path)
     if os.path.exists(root / SUMMARY):
@@ -85,7 +85,7 @@ def view(
         warn(f"note: the run is not finished: {done} of {opened.planned} rollouts")
     if not opened.rollouts:
         raise InputError(f"{root}: no rollout has finished", "Wait for the first.")
-    wanted = cells_wanted(opened.rollouts, cell, asked)
+    wanted = cells_wanted(opened.rollouts, cell, selection)
     page = out or root / PAGE
     made = write_page(opened, page, wanted)
     facts = {
@@ -106,24 +106,29 @@ def view(
 
 
 def _view_scenario(
-    what: str, asked: Wanted, overrides: Sequence[str], out: Path | None, as_json: bool
+    scenario_name: str, selection: Wanted, overrides: Sequence[str], out: Path | None, as_json: bool
 ) -> None:
     from alpasim_plugin.cli.preview import draw_preview  # loads matplotlib and a renderer
     from scenarios.load import load_scenario
 
-    if asked.scenes or asked.policies or len(asked.seeds) > 1 or len(asked.renderers) > 1:
+    if (
+        selection.scenes
+        or selection.policies
+        or len(selection.seeds) > 1
+        or len(selection.renderers) > 1
+    ):
         raise InputError(
-            f"{what}: neither a run nor a rollout",
+            f"{scenario_name}: neither a run nor a rollout",
             "Name a run folder, or for a scenario at most one --seed and one --renderer.",
         )
-    scene = load_scenario(what, next(iter(asked.seeds), None), overrides)
+    scene = load_scenario(scenario_name, next(iter(selection.seeds), None), overrides)
     path = out or Path(f"{slug(scene.scene_id)}.png")
-    made = draw_preview(scene, path, next(iter(asked.renderers), None))
+    made = draw_preview(scene, path, next(iter(selection.renderers), None))
     facts = {"preview": str(path), "scene": scene.scene_id, **made}
     show(as_json, facts, *made["facts"], f"preview  {path}")
 
 
-def cells_wanted(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wanted:
+def cells_wanted(rollouts: Sequence[Rollout], cell: str, selection: Wanted) -> Wanted:
     """Return which rollouts to show: of a run what was asked for, of a rollout those of its scene,
     policy and seed behind the renderers that were.
 
@@ -131,14 +136,14 @@ def cells_wanted(rollouts: Sequence[Rollout], cell: str, asked: Wanted) -> Wante
         InputError: There is no such rollout, or more than renderers is asked for beside it.
     """
     if not cell:
-        return asked
-    if asked.scenes or asked.policies or asked.seeds:
+        return selection
+    if selection.scenes or selection.policies or selection.seeds:
         raise InputError(
             f"{cell}: --scene, --policy or --seed with a rollout, which has one of each",
             "Name its run folder.",
         )
-    found = named_rollout(rollouts, cell)
-    return Wanted((found.scene,), (found.policy,), (found.seed,), asked.renderers)
+    rollout = named_rollout(rollouts, cell)
+    return Wanted((rollout.scene,), (rollout.policy,), (rollout.seed,), selection.renderers)
 
 
 REPORT_EPILOG = """
@@ -152,7 +157,7 @@ Examples:
 
 def report(
     run: Run = None,
-    every: Annotated[bool, Flag("Print every metric too.", "--all")] = False,
+    all_metrics: Annotated[bool, Flag("Print every metric too.", "--all")] = False,
     as_json: Json = False,
 ) -> None:
     """Write the reports of a run again and print its table."""
@@ -162,6 +167,6 @@ def report(
     opened = read_run(folder)
     facts = {"report": str(page), "summary": to_json(opened.summary)}
     lines = first_screen(opened)
-    if every:
+    if all_metrics:
         lines += ["", *metric_lines(opened.summary, known=opened.table)]
     show(as_json, facts, *lines, f"report   {page}")

@@ -64,8 +64,8 @@ def batched(
     for index, item in enumerate(items):
         groups.setdefault(key(item), []).append(index)
     made: dict[int, Any] = {}
-    for mine in groups.values():
-        made |= zip(mine, make([items[index] for index in mine]), strict=True)
+    for indices in groups.values():
+        made |= zip(indices, make([items[index] for index in indices]), strict=True)
     return [made[index] for index in range(len(items))]
 
 
@@ -160,7 +160,7 @@ class CapturedFunction:
     ) -> None:
         import torch
 
-        self._given = {
+        self._inputs = {
             name: torch.zeros(shape, dtype=dtype, device=device) for name, shape, dtype in sizes
         }
         self._graph = torch.cuda.CUDAGraph()
@@ -170,18 +170,18 @@ class CapturedFunction:
             side.wait_stream(main)
             with torch.cuda.stream(side):  # libraries choose their kernels in the first calls
                 for _ in range(WARM_UP):
-                    function(**self._given)
+                    function(**self._inputs)
             main.wait_stream(side)
             with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
-                self._made = function(**self._given)
+                self._outputs = function(**self._inputs)
 
     def __call__(self, tensors: Mapping[str, Tensor]) -> list[Tensor]:
         """Return the function's results."""
         with self._lock:
             for name, part in tensors.items():
-                self._given[name].copy_(part)
+                self._inputs[name].copy_(part)
             self._graph.replay()
-            return [part.clone() for part in self._made]
+            return [part.clone() for part in self._outputs]
 
 
 def known_false(mask: Tensor) -> bool:

@@ -144,11 +144,11 @@ class InternalError(SimrunError):
             command: The command that ran.
         """
         frames = traceback.extract_tb(error.__traceback__)
-        where = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+        location = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
         do_this = (
             "run the command with --debug and report the traceback to whoever maintains that file"
         )
-        return cls(f"{command}: {type(error).__name__}: {error}{where}", do_this)
+        return cls(f"{command}: {type(error).__name__}: {error}{location}", do_this)
 
 
 class Stopped(BaseException):

@@ -14,9 +14,8 @@ _CONTROLS = re.compile(
 )
 # What XML 1.0 has no way to write (section 2.2, production Char).
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-_MARKDOWN = re.compile(
-    r"([\\`*\[\]|~#!]|(?<![^\W_])_|_(?![^\W_]))"
-)  # an underscore inside a word means nothing
+# an underscore inside a word means nothing
+_MARKDOWN = re.compile(r"([\\`*\[\]|~#!]|(?<![^\W_])_|_(?![^\W_]))")
 
 
 def shorten(text: str, most: int = MAX_PART) -> str:
@@ -43,7 +42,7 @@ def terminal(text: str) -> str:
         'red\\x1b[31m'
     """
     return _CONTROLS.sub(
-        lambda found: " " if found[0] in "\t\n\v\f\r\xa0\u2028\u2029" else _written(found[0]), text
+        lambda match: " " if match[0] in "\t\n\v\f\r\xa0\u2028\u2029" else _written(match[0]), text
     )
 
 
@@ -67,7 +66,7 @@ def xml(text: str) -> str:
         >>> xml("a\x00b")
         'a\\x00b'
     """
-    return _NOT_XML.sub(lambda found: _written(found[0]), text)
+    return _NOT_XML.sub(lambda match: _written(match[0]), text)
 
 
 def _written(character: str) -> str:

@@ -259,10 +259,10 @@ def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
         keep = np.concatenate([[True], rises])
         s = s[keep]
         line = line[keep]
-    at = np.asarray(s_m, np.float64)
-    out = np.empty((*at.shape, line.shape[1]))
+    query_s_m = np.asarray(s_m, np.float64)
+    out = np.empty((*query_s_m.shape, line.shape[1]))
     for d in range(line.shape[1]):
-        out[..., d] = np.interp(at, s, line[:, d])
+        out[..., d] = np.interp(query_s_m, s, line[:, d])
     return out
 
 
@@ -283,9 +283,8 @@ def project(line: F64, xy: F64) -> tuple[float, float]:
     return float(s[i] + f[i] * np.sqrt(length2[i])), float(np.copysign(np.sqrt(distance2[i]), side))
 
 
-UNIT_CORNERS = np.array(
-    [[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]]
-)  # front-left, front-right, rear-right, rear-left
+# front-left, front-right, rear-right, rear-left
+UNIT_CORNERS = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]])
 
 
 def rectangle_corners(xy: F64, yaw: F64, size: F64) -> F64:

@@ -16,7 +16,9 @@ from alpasim_plugin.core.types import F32, U8
 CAP_DB = 100.0  # of identical images, whose ratio is infinite
 WINDOW_PX = 11
 SIGMA_PX = 1.5
-C1, C2 = 0.01**2, 0.03**2  # for values in 0 to 1
+# Constants of SSIM, for values in 0 to 1.
+C1 = 0.01**2
+C2 = 0.03**2
 # uint8 sRGB value, 0..255: an image is black when no channel of any pixel is above it; AlpaSim's
 # img_is_black
 BLACK_MAX = 10
@@ -56,13 +58,13 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
     a, b = (np.ascontiguousarray(x, np.float32) / np.float32(peak) for x in (image, truth))
     mu_a = gaussian_blur(a)
     mu_b = gaussian_blur(b)
-    both = mu_a * mu_b
+    mu_ab = mu_a * mu_b
     square_a = mu_a * mu_a
     square_b = mu_b * mu_b
     var_a = gaussian_blur(a * a) - square_a
     var_b = gaussian_blur(b * b) - square_b
-    cov = gaussian_blur(a * b) - both
-    value = (2 * both + C1) * (2 * cov + C2) / ((square_a + square_b + C1) * (var_a + var_b + C2))
+    cov = gaussian_blur(a * b) - mu_ab
+    value = (2 * mu_ab + C1) * (2 * cov + C2) / ((square_a + square_b + C1) * (var_a + var_b + C2))
     return float(value.mean(dtype=np.float64))
 
 

@@ -95,9 +95,8 @@ class Declaration:
 class Renderer(Protocol):
     """One rollout's renderer session."""
 
-    lookahead: int = (
-        0  # requests carry a forecast of so many of the camera's next frames in ``ahead``
-    )
+    # requests carry a forecast of so many of the camera's next frames in ``ahead``
+    lookahead: int = 0
     block: BlockRule | None = (
         # frames come in blocks of so many, and the policy is asked at each block's end; None: one
         # by one
@@ -168,9 +167,8 @@ class Policy(Protocol):
     """Plans from observations."""
 
     sensors: Sequence[SensorSpec]  # which cameras, at which rate; nothing else is rendered
-    controller: str = (
-        "bicycle"  # which controller moves the ego along its plans; declared on the class
-    )
+    # which controller moves the ego along its plans; declared on the class
+    controller: str = "bicycle"
 
     @abstractmethod
     def reset(self, seed: int, route: Route) -> None:
@@ -231,9 +229,8 @@ class Controller(Protocol):
 class Evaluator(Protocol):
     """Pure: a log in, series out; never a renderer, a policy or a GPU."""
 
-    metrics: Mapping[str, MetricInfo] = (
-        EMPTY  # the metrics that it gives and that `evaluators.metrics.METRICS` does not hold
-    )
+    # the metrics that it gives and that `evaluators.metrics.METRICS` does not hold
+    metrics: Mapping[str, MetricInfo] = EMPTY
 
     @abstractmethod
     def __call__(self, rollout: RolloutLog, scene: Scene) -> Sequence[MetricSeries]:
@@ -264,14 +261,14 @@ class Source(Protocol):
 T = TypeVar("T")
 
 
-def complete(part: T, interface: Any, what: str = "") -> T:
+def complete(part: T, interface: Any, part_name: str = "") -> T:
     """Return a part with the defaults of the optional members that it does not define.
 
     Args:
         part: Any object with the interface's required members; it need not inherit from the
             interface.
         interface: Of this module.
-        what: The part for messages.
+        part_name: The part for messages.
 
     Raises:
         InputError: A required member is missing; of a policy it is a `PolicyError`, since only the
@@ -280,10 +277,10 @@ def complete(part: T, interface: Any, what: str = "") -> T:
     required, optional = _members(interface)
     if inspect.isclass(part):
         raise contract_error(interface.__name__.lower())(
-            f"{what}: the class {part.__name__}, not an object of it",
+            f"{part_name}: the class {part.__name__}, not an object of it",
             f"Name the class itself, or return {part.__name__}(...).",
         )
-    _require_none([n for n in required if not hasattr(part, n)], type(part), interface, what)
+    _require_none([n for n in required if not hasattr(part, n)], type(part), interface, part_name)
     for name, default in optional.items():
         if not hasattr(part, name):
             value = dict(default) if isinstance(default, Mapping) else default
@@ -291,7 +288,7 @@ def complete(part: T, interface: Any, what: str = "") -> T:
     return part
 
 
-def require_methods(factory: type, interface: Any, what: str) -> None:
+def require_methods(factory: type, interface: Any, part_name: str) -> None:
     """Refuse a class without a method that its kind of part must have, before one is made.
 
     Raises:
@@ -300,15 +297,15 @@ def require_methods(factory: type, interface: Any, what: str) -> None:
     required, _ = _members(interface)
     methods = [name for name in required if name not in interface.__annotations__]
     lacking = [name for name in methods if not hasattr(factory, name)]
-    _require_none(lacking, factory, interface, what)
+    _require_none(lacking, factory, interface, part_name)
 
 
-def _require_none(lacking: Sequence[str], made_by: type, interface: Any, what: str) -> None:
+def _require_none(lacking: Sequence[str], made_by: type, interface: Any, part_name: str) -> None:
     if lacking:
         kind = interface.__name__.lower()
         required, _ = _members(interface)
         raise contract_error(kind)(
-            f"{what or made_by.__name__}: a {made_by.__name__} without {', '.join(lacking)}",
+            f"{part_name or made_by.__name__}: a {made_by.__name__} without {', '.join(lacking)}",
             f"give it {', '.join(f'`{name}`' for name in required)}; docs/extending.md shows a {kind}",
         )
 
@@ -322,8 +319,10 @@ def contract_error(kind: str) -> type[SimrunError]:
 
 def _members(interface: Any) -> tuple[list[str], dict[str, Any]]:
     """Return the names of the required members, and the optional ones with their defaults."""
-    own = vars(interface)
-    required = [name for name in interface.__annotations__ if name not in own]
-    required += [name for name in own if getattr(own[name], "__isabstractmethod__", False)]
-    optional = [name for name in own if not name.startswith("_") and name not in required]
-    return required, {name: own[name] for name in optional}
+    namespace = vars(interface)
+    required = [name for name in interface.__annotations__ if name not in namespace]
+    required += [
+        name for name in namespace if getattr(namespace[name], "__isabstractmethod__", False)
+    ]
+    optional = [name for name in namespace if not name.startswith("_") and name not in required]
+    return required, {name: namespace[name] for name in optional}

@@ -19,8 +19,8 @@ def sources_digest(file: str) -> str:
     """Return a SHA-256 over the content of `sources_of` a file, and over their names; of a file that
     is not simrun's over those of its folder.
     """
-    own = os.path.realpath(file)
-    root = ROOT if own.startswith(os.path.join(ROOT, "")) else Path(own).parent
+    real_file = os.path.realpath(file)
+    root = ROOT if real_file.startswith(os.path.join(ROOT, "")) else Path(real_file).parent
     hashed = hashlib.sha256()
     for path in sorted(sources_of(file, root)):
         hashed.update(os.path.relpath(path, os.path.realpath(root)).encode())
@@ -37,13 +37,13 @@ def sources_of(file: str, root: Path = ROOT) -> set[str]:
     start = os.path.realpath(file)
     module = _module(start, os.path.realpath(root))
     todo = [(start, name) for name in module.kernels or (EVERYTHING,)]
-    seen: set[tuple[str, str]] = set()
+    visited: set[tuple[str, str]] = set()
     while todo:
         place = todo.pop()
-        if place not in seen:
-            seen.add(place)
+        if place not in visited:
+            visited.add(place)
             todo += _module(place[0], os.path.realpath(root)).used_by(place[1])
-    return {path for path, _ in seen}
+    return {path for path, _ in visited}
 
 
 @dataclass(frozen=True)

@@ -81,21 +81,23 @@ def installed_names(group: str, taken: Mapping[str, str]) -> dict[str, str]:
     Raises:
         InputError: Two packages claim one name.
     """
-    found: dict[str, str] = {}
+    targets: dict[str, str] = {}
     for point in _points(group, _search_path()):
-        other = found.get(point.name, taken.get(point.name))
+        other = targets.get(point.name, taken.get(point.name))
         if other is not None and other != point.value:
             raise InputError(
                 f"entry point {point.name!r} = {point.value!r}: the name is taken by {other}",
                 "uninstall one of the two packages or rename its entry point",
             )
-        found[point.name] = point.value
-    return found
+        targets[point.name] = point.value
+    return targets
 
 
 def _search_path() -> tuple[str, ...]:
-    here = os.path.realpath(os.getcwd())
-    return tuple(folder for folder in sys.path if folder and os.path.realpath(folder) != here)
+    working_folder = os.path.realpath(os.getcwd())
+    return tuple(
+        folder for folder in sys.path if folder and os.path.realpath(folder) != working_folder
+    )
 
 
 @lru_cache(maxsize=64)
@@ -108,11 +110,11 @@ def _points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """
     from importlib.metadata import distributions
 
-    seen = set[str]()
-    found: list[EntryPoint] = []
-    for one in distributions(path=list(path)):
-        points = one.entry_points.select(group=group)
-        if points and one.name not in seen:  # the name takes long to read
-            seen.add(one.name)
-            found += points
-    return tuple(found)
+    names = set[str]()
+    entry_points: list[EntryPoint] = []
+    for distribution in distributions(path=list(path)):
+        points = distribution.entry_points.select(group=group)
+        if points and distribution.name not in names:  # the name takes long to read
+            names.add(distribution.name)
+            entry_points += points
+    return tuple(entry_points)

@@ -100,13 +100,13 @@ class Signal:
         normal = np.array([-along[1], along[0]])
         normal *= np.sign(normal @ (np.cos(self.heading_rad), np.sin(self.heading_rad)))
         beyond = (line[:, :2] - start[:2]) @ normal
-        found = []
+        crossings = []
         for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
             share = float(beyond[k] / (beyond[k] - beyond[k + 1]))
             projection = (line[k, :2] + share * (line[k + 1, :2] - line[k, :2]) - start[:2]) @ along
             if 0.0 <= projection <= along @ along and abs(line[k, 2] - start[2]) <= LEVEL_M:
-                found.append((k, share))
-        return found
+                crossings.append((k, share))
+        return crossings
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,8 @@ class LaneMap:
     markings: tuple[Marking, ...] = ()
     poles: tuple[F64, ...] = ()  # each (N, 3) polyline
     signs: tuple[tuple[F64, Box], ...] = ()  # (T_world_sign (4, 4), size)
-    signals: tuple[Signal, ...] | None = (
-        None  # traffic lights with their states; None: not known, also where there is none
-    )
+    # traffic lights with their states; None: not known, also where there is none
+    signals: tuple[Signal, ...] | None = None
     give_way: tuple[Signal, ...] = ()  # lines without phases, at which one lets others pass
 
 

@@ -4,9 +4,8 @@ import math
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
-RATE_MARGIN = (
-    0.02  # how much more often a flag may be set where neither it nor a gate says otherwise
-)
+# how much more often a flag may be set where neither it nor a gate says otherwise
+RATE_MARGIN = 0.02
 Aggregation = Literal["mean", "median", "max", "min", "last"]
 Direction = Literal["lower", "higher", "none"]
 

@@ -130,13 +130,13 @@ class PathEnd:
             self._ahead = ahead / np.hypot(*ahead)
             self._tracker = PathTracker(line)
 
-    def ends_rollout(self, at: F64) -> bool:
+    def ends_rollout(self, axle_xy: F64) -> bool:
         """Note where the ego's rear axle is, ``(2,)``, metres, world; return whether the rollout
         ends here.
         """
         if self._has_end and not self.passed:
-            s_m = self._tracker.follow(at)
-            offset = at - self._end
+            s_m = self._tracker.follow(axle_xy)
+            offset = axle_xy - self._end
             aside_m = abs(float(cross(self._ahead, offset)))
             is_beyond = s_m >= self._length_m * (1 - 1e-12) and offset @ self._ahead > 0.0
             self.passed = bool(is_beyond and aside_m <= ASIDE_M)

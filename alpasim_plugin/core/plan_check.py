@@ -103,9 +103,9 @@ def shape_problem(plan: Any, min_rows: int = 1) -> str:
 
 def plan_problem(plan: Any, now_us: int) -> str:
     """Say what keeps a plan made at ``now_us`` from being followed; empty if nothing."""
-    found = shape_problem(plan)
-    if found:
-        return found
+    problem = shape_problem(plan)
+    if problem:
+        return problem
     if plan.times_us.dtype.kind not in "iu":
         return f"times_us is {plan.times_us.dtype}, not integer microseconds"
     if int(plan.times_us[0]) != now_us:
@@ -135,12 +135,12 @@ def clock_problem(times_us: I64, now_us: int) -> str:
     """
     before_s = (now_us - int(times_us[-1])) * 1e-6
     away_s = (int(times_us[0]) - now_us) * 1e-6
-    found = ""
+    problem = ""
     if before_s > 0:
-        found = f"the plan ends {before_s:,.0f} s before now"
+        problem = f"the plan ends {before_s:,.0f} s before now"
     elif abs(away_s) > STALE_S:
-        found = f"the plan begins {away_s:,.0f} s from now"
-    return f"{found}: times are microseconds of the clock of the query" if found else ""
+        problem = f"the plan begins {away_s:,.0f} s from now"
+    return f"{problem}: times are microseconds of the clock of the query" if problem else ""
 
 
 def _a(value: Any) -> str:

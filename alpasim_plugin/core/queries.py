@@ -6,21 +6,21 @@ from urllib.parse import parse_qsl
 from alpasim_plugin.core.errors import InputError
 
 
-def options_of(query: str, known: Collection[str], where: str) -> dict[str, str]:
+def options_of(query: str, names: Collection[str], text: str) -> dict[str, str]:
     """Return the options of a query ``NAME=VALUE&...``.
 
     Args:
         query: What follows the question mark.
-        known: Names that may be given.
-        where: The whole text, for the error.
+        names: Names that may be given.
+        text: The whole text, for the error.
 
     Raises:
         InputError: An option has another name.
     """
-    given = dict(parse_qsl(query, keep_blank_values=True))
-    for name in given:
-        if name not in known:
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    for name in options:
+        if name not in names:
             raise InputError(
-                f"{where}: no option {name!r}", f"Use only {', '.join(known) or 'the address'}."
+                f"{text}: no option {name!r}", f"Use only {', '.join(names) or 'the address'}."
             )
-    return given
+    return options

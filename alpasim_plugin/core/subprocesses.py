@@ -47,10 +47,12 @@ def own_path_only() -> None:
     names it; undo `safe_path`.
     """
     forget_safe_path()
-    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    here = os.path.realpath(os.getcwd())
+    user_folders = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    working_folder = os.path.realpath(os.getcwd())
     sys.path[:] = [
-        folder for folder in sys.path if folder in given or os.path.realpath(folder) != here
+        folder
+        for folder in sys.path
+        if folder in user_folders or os.path.realpath(folder) != working_folder
     ]
 
 
@@ -77,7 +79,9 @@ class _Output(io.TextIOBase):
     """Standard error, and a file that is made when there is something to write."""
 
     def __init__(self, path: Path | None) -> None:
-        self._path, self._written, self._rest = path, 0, LEFT_OUT
+        self._path = path
+        self._written = 0
+        self._closing_line = LEFT_OUT
         self._file: TextIO | None = None
         self._lock = threading.Lock()
 
@@ -87,16 +91,16 @@ class _Output(io.TextIOBase):
     def write(self, text: str) -> int:
         """Write to both, up to the limit; several threads may."""
         with self._lock:
-            shown = text
+            output = text
             self._written += len(text)
             if self._written >= MOST_BYTES:
-                shown = self._rest
-                self._rest = ""
-            sys.stderr.write(shown)
+                output = self._closing_line
+                self._closing_line = ""
+            sys.stderr.write(output)
             if self._path is not None:
                 if self._file is None:
                     self._file = self._path.open("w", encoding="utf-8", errors="replace")
-                self._file.write(shown)
+                self._file.write(output)
                 self._file.flush()
         return len(text)
 

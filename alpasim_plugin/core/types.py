@@ -163,9 +163,8 @@ class Exposure:
 
     # (H, W), (H, 1) or (1, W): 0 at shutter start, 1 at its end; NaN: nobody looks at that pixel
     share: F32
-    actors_start: Mapping[
-        str, F64
-    ]  # T_world_box (4, 4) at shutter start, of the same actors as at its end
+    # T_world_box (4, 4) at shutter start, of the same actors as at its end
+    actors_start: Mapping[str, F64]
 
 
 @dataclass(frozen=True)
@@ -176,12 +175,10 @@ class RenderRequest:
     camera: CameraSpec
     T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
-    ahead: Sequence[
-        RenderRequest
-    ] = ()  # forecast of this camera's next requests; only for a renderer with `lookahead`
-    exposure: Exposure | None = (
-        None  # of a rolling shutter; None: all pixels are exposed at the shutter's end
-    )
+    # forecast of this camera's next requests; only for a renderer with `lookahead`
+    ahead: Sequence[RenderRequest] = ()
+    # of a rolling shutter; None: all pixels are exposed at the shutter's end
+    exposure: Exposure | None = None
 
 
 # Facts of a frame that a fixer made of recorded ones: shares of the image, 0 to 1, and both by
@@ -258,12 +255,11 @@ class Frame:
     # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
     depth: F32 | None = cast(F32 | None, _Plane())
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
-    facts: Mapping[str, float | str] = field(
-        default_factory=dict
-    )  # about this frame, for the log, such as "pose_error_m"
-    references: tuple[
-        U8, ...
-    ] = ()  # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they hold
+    # about this frame, for the log, such as "pose_error_m"
+    facts: Mapping[str, float | str] = field(default_factory=dict)
+    # (H, W, 4) recorded frames, warped into the view, nearest first; the last channel: where they
+    # hold
+    references: tuple[U8, ...] = ()
     on_device: DevicePlanes | None = None  # of a frame that a device drew
     fixed: tuple[U8, Any] | None = None  # an image that a fixer made, and the same as a tensor
 
@@ -317,14 +313,10 @@ class Photograph:
     K: F64  # (3, 3) pixels
     T_world_camera: F64  # (4, 4)
     path: str  # of the image
-    use: Literal["fitted", "held-out", "never-fitted"] = (
-        "fitted"  # by the reconstruction; never-fitted: all of a further camera
-    )
-    exposure: tuple[float, float, float] = (
-        1.0,
-        1.0,
-        1.0,
-    )  # gain of each channel, by which the reconstruction explains this image
+    # by the reconstruction; never-fitted: all of a further camera
+    use: Literal["fitted", "held-out", "never-fitted"] = "fitted"
+    # gain of each channel, by which the reconstruction explains this image
+    exposure: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,9 +328,9 @@ class RecordedFrame:
     K: F64  # (3, 3) pixels, of the image
     T_world_camera: F64  # (4, 4), as the reconstruction believes
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
-    read: Callable[
-        [], tuple[U8, F32]
-    ]  # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or sky
+    # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or
+    # sky
+    read: Callable[[], tuple[U8, F32]]
 
 
 # --- policy
@@ -434,9 +426,8 @@ class Environment:
     poles_spacing_m: float = 30.0  # 0: none
     sky: Literal["clear", "overcast", "dusk"] = "clear"
     texture: float = 1.0  # contrast of ground and facade texture, 0..1
-    fog_visibility_m: float | None = (
-        None  # distance at which 2 % of a contrast is left; None: clear
-    )
+    # distance at which 2 % of a contrast is left; None: clear
+    fog_visibility_m: float | None = None
     time: Literal["day", "low_sun", "night"] = "day"
     rain: float = 0.0  # mm/h
     snow: float = 0.0  # mm/h of water
@@ -458,9 +449,8 @@ class Degradation:
 
     kind: Literal["reconstruction", "cycle", "none"] = "reconstruction"
     share: float = 0.15  # of the fit's schedule, 0..1; reconstruction and cycle
-    shift_m: float = (
-        1.0  # sideways, left positive, of the views that the cycle's model is fitted to
-    )
+    # sideways, left positive, of the views that the cycle's model is fitted to
+    shift_m: float = 1.0
     # of the log, that the model is fitted to; reconstruction and cycle, as are the next two
     views_per_s: float = 6.0
     depth_error: float = 0.1  # spread of the distance of the points it starts from, as a share
@@ -506,9 +496,8 @@ class Scene:
     lane_map: LaneMap
     ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
     vehicle: Vehicle
-    alpasim_map: LaneMap | None = (
-        None  # the same road as AlpaSim's own loader reads it, where that differs
-    )
+    # the same road as AlpaSim's own loader reads it, where that differs
+    alpasim_map: LaneMap | None = None
     standing: Standing = "known"
     # (N, 3) metres, world: the lane behind the recorded drive, as far as a rollout may go
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
@@ -537,20 +526,15 @@ class Scenario:
     environment: Environment
     degradation: Degradation
     background: BackgroundFile | None = None
-    world_origin: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # what was subtracted from the source's coordinates, metres
+    # what was subtracted from the source's coordinates, metres
+    world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     content_hash: str = ""
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
-    alpasim_map: LaneMap | None = (
-        None  # the same road as AlpaSim's own loader reads it, where that differs
-    )
+    # the same road as AlpaSim's own loader reads it, where that differs
+    alpasim_map: LaneMap | None = None
     source_part: str | None = None  # the source that read the log, as named; None: a built road
-    varied: Mapping[str, tuple[Any, Any]] = field(
-        default_factory=dict
-    )  # key of the scenario file -> (as written, as drawn by the seed)
+    # key of the scenario file -> (as written, as drawn by the seed)
+    varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
     model: str | None = (
         # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and
@@ -571,8 +555,10 @@ class Scenario:
 
     def period_us(self, sensor: SensorSpec) -> int:
         """Return the time between the frames of a camera that a policy asks for."""
-        own = {camera.name: camera.interval_us for camera in self.cameras}
-        return sensor.interval_us or own.get(sensor.camera, 0) or self.rates.camera_us
+        interval_by_camera = {camera.name: camera.interval_us for camera in self.cameras}
+        return (
+            sensor.interval_us or interval_by_camera.get(sensor.camera, 0) or self.rates.camera_us
+        )
 
     @property
     def shown_files(self) -> list[str]:

@@ -23,7 +23,12 @@ from alpasim_plugin.core.types import (
     read_only,
 )
 from alpasim_plugin.gaussians.scene.log_views import actors_at
-from alpasim_plugin.runs.loop_state import Forecaster, PredictedRequests, drawn, shutter_poses
+from alpasim_plugin.runs.loop_state import (
+    Forecaster,
+    PredictedRequests,
+    shutter_poses,
+    visible_actors,
+)
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ class CameraRig:
         forecaster: Forecaster | None = None,
         lookahead: int = 0,
     ) -> None:
-        known = {camera.name: camera for camera in scenario.cameras}
+        cameras_by_name = {camera.name: camera for camera in scenario.cameras}
         self._due: list[tuple[CameraSpec, int]] = []
         self._held: list[RenderRequest] = []
         self._clock = clock
@@ -140,8 +145,8 @@ class CameraRig:
         self._lookahead = lookahead
         self._before: Mapping[str, F64] = {}  # the road users one control period ago
         for sensor in sensors:
-            if sensor.camera not in known:
-                names = ", ".join(sorted(known)) or "none"
+            if sensor.camera not in cameras_by_name:
+                names = ", ".join(sorted(cameras_by_name)) or "none"
                 raise InputError(
                     f"scene {scenario.scene_id!r}: the policy asks for camera {sensor.camera!r}; the scenario's cameras: {names}",
                     "Name one of them in the policy's sensors, or add the camera to `cameras` of the scenario.",
@@ -152,7 +157,7 @@ class CameraRig:
                     f"camera {sensor.camera!r}: period {period} us is no multiple of the control period {clock.rates.control_us} us",
                     "choose a whole multiple",
                 )
-            self._due.append((read_only(known[sensor.camera]), period))
+            self._due.append((read_only(cameras_by_name[sensor.camera]), period))
 
     @property
     def specs(self) -> dict[str, CameraSpec]:
@@ -173,7 +178,7 @@ class CameraRig:
         In a cadence of whole blocks the requests of a block are returned together when its last
         frame is due.
         """
-        shown = drawn(actors)
+        actor_poses = visible_actors(actors)
         forecast = self._forecaster.now() if self._forecaster and self._lookahead else None
         for camera, period in self._due:
             if self._is_due(tick.t_us, period):
@@ -184,11 +189,13 @@ class CameraRig:
                 )
                 T_world_camera = shutter_poses(history, camera, tick.t_us)
                 exposure = rolling_exposure(
-                    camera, self._before, shown, self._clock.rates.control_us
+                    camera, self._before, actor_poses, self._clock.rates.control_us
                 )
-                request = RenderRequest(tick.t_us, camera, T_world_camera, shown, ahead, exposure)
+                request = RenderRequest(
+                    tick.t_us, camera, T_world_camera, actor_poses, ahead, exposure
+                )
                 self._held.append(read_only(request))
-        self._before = shown
+        self._before = actor_poses
         if self._cadence.whole_blocks and not self._cadence.queries_at(tick.t_us):
             return []
         ready = self._held
@@ -222,7 +229,9 @@ def logged_request(log: RolloutLog, camera: CameraSpec, t_us: int) -> RenderRequ
     """
     shutter_us = [max(t_us - camera.shutter_us, int(log.ego.t_us[0])), t_us]
     T_world_rig = interpolate(log.ego, shutter_us) @ inverse(log.T_rig_box)
-    shown = drawn(actors_at(log.actors.values(), t_us))
-    before = drawn(actors_at(log.actors.values(), t_us - log.control_us))
-    exposure = rolling_exposure(camera, before, shown, log.control_us)
-    return RenderRequest(t_us, camera, T_world_rig @ camera.T_rig_camera, shown, exposure=exposure)
+    actor_poses = visible_actors(actors_at(log.actors.values(), t_us))
+    before = visible_actors(actors_at(log.actors.values(), t_us - log.control_us))
+    exposure = rolling_exposure(camera, before, actor_poses, log.control_us)
+    return RenderRequest(
+        t_us, camera, T_world_rig @ camera.T_rig_camera, actor_poses, exposure=exposure
+    )

@@ -377,10 +377,11 @@ def _log_traceback(error: BaseException, folder: Path) -> None:
     if isinstance(cause, SimrunError):
         return
     text = "".join(traceback.format_exception(cause))
+    # the disk may be what failed; the manifest has it too
     with (
         suppress(OSError),
         (folder / OUTPUT_NAME).open("a", encoding="utf-8") as log,
-    ):  # the disk may be what failed; the manifest has it too
+    ):
         log.write(text)
 
 

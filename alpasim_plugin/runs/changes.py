@@ -47,48 +47,48 @@ def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> li
     return changed
 
 
-def sentence(count: int, found: Sequence[str]) -> str:
+def sentence(count: int, all_reasons: Sequence[str]) -> str:
     """Say how many rollouts are driven again, and why."""
     rollouts = "1 rollout is" if count == 1 else f"{count} rollouts are"
-    causes = list(dict.fromkeys(found))
+    causes = list(dict.fromkeys(all_reasons))
     return f"{rollouts} driven again: {some_of(causes, SHOWN_FILES)}"
 
 
 def _files_of(name: str, held: JsonView, plan: RunPlan) -> list[str]:
     """Name the files by which a scene or a part differs from what ``run.json`` states of it."""
-    kind, _, own = name.partition(" ")
+    kind, _, label = name.partition(" ")
     if kind == "scene":
-        facts: JsonView = (held.get("scenes") or {}).get(own) or {}
-        return _file_changes(facts.get("files") or {}, plan.scenarios[own].files)
+        facts: JsonView = (held.get("scenes") or {}).get(label) or {}
+        return _file_changes(facts.get("files") or {}, plan.scenarios[label].files)
     stated: JsonView = held.get("parts") or {}
-    found: list[str] = []
+    changes: list[str] = []
     for part in plan.parts:
-        if not _is_part_of(f"{part.kind} {part.name}", kind, own, plan):
+        if not _is_part_of(f"{part.kind} {part.name}", kind, label, plan):
             continue
         facts = stated.get(f"{part.kind} {part.name}") or {}
         for key, now in (("code", part.code), ("files", part.files)):
             if key in facts:
-                found += _file_changes(facts[key], now)
-    return found
+                changes += _file_changes(facts[key], now)
+    return changes
 
 
-def _is_part_of(part: str, kind: str, own: str, plan: RunPlan) -> bool:
+def _is_part_of(part: str, kind: str, label: str, plan: RunPlan) -> bool:
     """Tell whether a part is what a rollout is made of under a name; a renderer has two."""
     if kind != "renderer":
-        return part == f"{kind} {own}"
-    spec = next(spec for spec in plan.renderers if spec.name == own)
+        return part == f"{kind} {label}"
+    spec = next(spec for spec in plan.renderers if spec.name == label)
     parts = [spec.base] if spec.fixer is None else [spec.base, spec.fixer]
     return part in {f"{one.kind} {one.name}" for one in parts}
 
 
 def _file_changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Name what happened to files: edited, gone, or read for the first time."""
-    said = []
+    changes = []
     for path, content in now.items():
         if path not in before:
-            said.append(f"{path} was not read before")
+            changes.append(f"{path} was not read before")
         elif content == ABSENT != before[path]:
-            said.append(f"{path} is gone")
+            changes.append(f"{path} is gone")
         elif content != before[path]:
-            said.append(f"{path} was edited")
-    return said
+            changes.append(f"{path} was edited")
+    return changes

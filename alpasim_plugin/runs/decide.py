@@ -156,10 +156,15 @@ class SequentialTest:
         candidate = table.sides(policy)[self.candidate.renderer]
         base = table.sides(self.baseline.policy, policy)[self.baseline.renderer]
         scenes = self.order[: self.n_scenes]
-        asked = self.question.metrics
-        values = {one.metric: scene_harm(candidate, base, one.facts, scenes) for one in asked}
+        criteria = self.question.metrics
+        values = {
+            criterion.metric: scene_harm(candidate, base, criterion.facts, scenes)
+            for criterion in criteria
+        }
         self.lacking = [
-            one.metric for one in asked if one.binding and np.isnan(values[one.metric]).any()
+            criterion.metric
+            for criterion in criteria
+            if criterion.binding and np.isnan(values[criterion.metric]).any()
         ]
         self.state = state_after(self.question, values, len(self.order))
         self.looks.append({**vars(self.state), "rollouts": len(self.driven)})

@@ -9,7 +9,7 @@ therefore run rollouts in any order.
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -93,14 +93,14 @@ class HowToRun:
         return {} if self.executor.is_local else {"executor": str(self.executor)}
 
     @property
-    def here(self) -> Threads:
+    def local_threads(self) -> Threads:
         """Give the workers of this machine and their threads."""
         return self.threads if self.executor.is_local else thread_budget(1, 1)
 
     @property
-    def cores_here(self) -> int:
+    def local_cores(self) -> int:
         """Give the cores of this machine that a rollout may use when the others are done."""
-        return self.here.workers * self.here.per_worker
+        return self.local_threads.workers * self.local_threads.per_worker
 
 
 def execute(
@@ -129,12 +129,58 @@ def execute(
         held: What ``run.json`` said before; it names the files of what is driven again.
         hanging: By policy what its check says, where it hung or died: such a policy is not driven.
     """
-    manifests: dict[Path, JsonObject] = {}
-    todo = []
-    copies = []  # with the rollout that each is a copy of
+    work = _sort_cells(plan, root, how, on_done, notify, held, hanging)
+    if work.n_again:
+        notify(sentence(work.n_again, work.causes))
+
+    def take(done: Done) -> None:
+        for cell, manifest in done:
+            work.manifests[cell.folder] = manifest
+            on_done(manifest, False)
+
+    try:
+        take(_run(work.todo, plan, root, how))
+        jobs = [(cell, work.manifests[original.folder]) for cell, original in work.copies]
+        take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
+        take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
+    finally:
+        shutil.rmtree(root / STAGES, ignore_errors=True)
+    return [work.manifests[cell.folder] for cell in plan.cells]
+
+
+@dataclass
+class _Work:
+    """The rollouts of a plan, by what is to be done with them.
+
+    Attributes:
+        manifests: Folder -> manifest of what is finished.
+        todo: What is to be driven.
+        copies: What is to be copied, with its original.
+        n_again: How many of ``todo`` have been driven before.
+        causes: Why those are driven again.
+    """
+
+    manifests: dict[Path, JsonObject] = field(default_factory=dict)
+    todo: list[Cell] = field(default_factory=list)
+    copies: list[tuple[Cell, Cell]] = field(default_factory=list)
+    n_again: int = 0
+    causes: list[str] = field(default_factory=list)
+
+
+def _sort_cells(
+    plan: RunPlan,
+    root: Path,
+    how: HowToRun,
+    on_done: OnDone,
+    notify: Callable[[str], None],
+    held: JsonView,
+    hanging: Mapping[str, str],
+) -> _Work:
+    """Reuse or score again what the run folder holds, and list what is to be driven or copied; see
+    `execute`.
+    """
+    work = _Work()
     originals: dict[tuple[str, str, int], Cell] = {}
-    n_again = 0
-    causes: list[str] = []
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
         original = cell
@@ -142,47 +188,32 @@ def execute(
             original = originals.setdefault((cell.policy.name, cell.scene, cell.seed), cell)
         if state.damage:
             notify(f"damaged: {'; '.join(map(str, state.damage))}; it is made again")
-        driven = manifests.get(original.folder)  # None where it is still to be driven
+        # None where it is still to be driven
+        driven = work.manifests.get(original.folder)
         if original is not cell and (driven is None or is_copied(driven)):
             copied_from = state.manifest and state.manifest.get("copied_from")
             if driven is None or action != "none" or copied_from != driven["path"]:
-                copies.append((cell, original))
+                work.copies.append((cell, original))
                 continue
-        if action == "drive" or state.manifest is None:
+        manifest = state.manifest
+        if action == "drive" or manifest is None:
             if cell.policy.name in hanging:
                 error = PolicyError(hanging[cell.policy.name], NOT_DRIVEN)
-                manifests[cell.folder] = _write_failed(cell, root, error)
-                on_done(manifests[cell.folder], False)
+                work.manifests[cell.folder] = _write_failed(cell, root, error)
+                on_done(work.manifests[cell.folder], False)
                 continue
-            todo.append(cell)
-            why = [] if state.manifest is None else reasons(cell, state.manifest, held, plan)
-            n_again += bool(why)
-            causes += why
+            work.todo.append(cell)
+            why = [] if manifest is None else reasons(cell, manifest, held, plan)
+            work.n_again += bool(why)
+            work.causes += why
             continue
-        manifest = state.manifest
         if manifest["status"] != "ok":
             notify(kept_failure(cell, manifest))
         if action == "score":
             manifest = _rescored(cell, plan, root, manifest, how)
-        manifests[cell.folder] = manifest
+        work.manifests[cell.folder] = manifest
         on_done(manifest, True)
-
-    if n_again:
-        notify(sentence(n_again, causes))
-
-    def take(done: Done) -> None:
-        for cell, manifest in done:
-            manifests[cell.folder] = manifest
-            on_done(manifest, False)
-
-    try:
-        take(_run(todo, plan, root, how))
-        jobs = [(cell, manifests[original.folder]) for cell, original in copies]
-        take(_run([cell for cell, driven in jobs if not is_copied(driven)], plan, root, how))
-        take(_run_local([job for job in jobs if is_copied(job[1])], plan, root, how))
-    finally:
-        shutil.rmtree(root / STAGES, ignore_errors=True)
-    return [manifests[cell.folder] for cell in plan.cells]
+    return work
 
 
 def _rescored(
@@ -192,7 +223,7 @@ def _rescored(
     parts = ", ".join(part.name for part in cell.evaluators if part.is_users)
     work = partial(rescore_cell, options=plan.options, root=root.absolute(), manifest=manifest)
     try:
-        return apart(work, cell, parts, how.here.per_worker, how.limit_s)
+        return apart(work, cell, parts, how.local_threads.per_worker, how.limit_s)
     except SimrunError as error:
         return failed_manifest(cell, error)
 
@@ -211,11 +242,11 @@ def _run(todo: Sequence[Cell], plan: RunPlan, root: Path, how: HowToRun) -> Done
 
 def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) -> Done:
     """Drive or copy rollouts in this process, or in workers that write the run folder themselves."""
-    workers = how.here.workers
-    threads = how.here.per_worker
+    workers = how.local_threads.workers
+    threads = how.local_threads.per_worker
     if workers > 1:  # the slowest rollouts come first, so that all workers end together
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
-    work = partial(_work, plan.options, root.absolute(), how.here)
+    work = partial(_work, plan.options, root.absolute(), how.local_threads)
 
     def written(job: Job) -> JsonObject | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
@@ -231,11 +262,11 @@ def _users_parts(job: Job) -> str:
     return users_parts(job[0])
 
 
-def _work(options: RunOptions, root: Path, here: Threads, job: Job) -> JsonObject:
+def _work(options: RunOptions, root: Path, local_threads: Threads, job: Job) -> JsonObject:
     """Drive or copy a rollout in a worker of this machine."""
-    share_card(options.device, here.workers)
+    share_card(options.device, local_threads.workers)
     cell, original = job
-    threads = here.per_worker
+    threads = local_threads.per_worker
     with shown_in(root / STAGES):
         if original is None:
             return run_cell(cell, options, root, threads)

@@ -57,8 +57,10 @@ def eval_config() -> dict[str, Any]:
     """Return AlpaSim's evaluation settings: its defaults, no video, and no unpickling of what a
     driver sent.
     """
-    own = EvalSettings().model_dump(mode="json", exclude={"run_in_runtime", "vec_map", "video"})
-    return own | {
+    defaults = EvalSettings().model_dump(
+        mode="json", exclude={"run_in_runtime", "vec_map", "video"}
+    )
+    return defaults | {
         "vec_map": {
             "incl_road_edges": True,
             "incl_traffic_signs": True,
@@ -93,13 +95,13 @@ def scenes_of(info: JsonView) -> dict[str, tuple[ScenarioRef, Scenario]]:
     """
     out = {}
     for scene_id, stated in info["scenes"].items():
-        given = stated.get("ref") or {}
-        if "path" not in given:
+        stated_ref = stated.get("ref") or {}
+        if "path" not in stated_ref:
             raise InputError(
                 f"scene {scene_id!r}: run.json has no path of its scenario",
                 "export a folder that simrun run wrote",
             )
-        ref = ref_of(given)
+        ref = ref_of(stated_ref)
         require_installed([ref.source], f"scene {scene_id!r}")
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.content_hash != stated["content_hash"]:

@@ -40,12 +40,12 @@ class Film:
         if not times:
             return
         step_us = int(np.diff(times).min(initial=SECOND_US))
-        shown = {name: shot for t_us in reversed(times) for name, shot in self._shots[t_us].items()}
+        shots = {name: shot for t_us in reversed(times) for name, shot in self._shots[t_us].items()}
         tick = Fraction(1, SECOND_US)
         with VideoWriter(folder / VIDEO_NAME, tick, Fraction(SECOND_US, step_us)) as video:
             for t_us in times:
-                shown |= self._shots[t_us]
-                images = beside(list(map(decode_image, shown.values())))
+                shots |= self._shots[t_us]
+                images = beside(list(map(decode_image, shots.values())))
                 video.write(images, t_us - times[0], step_us)
 
 

@@ -179,8 +179,8 @@ def merge_sensors(
     """
     joined = {sensor.camera: sensor for sensor in first}
     for sensor in then:
-        known = joined.get(sensor.camera)
-        if known is None or scenario.period_us(sensor) < scenario.period_us(known):
+        earlier = joined.get(sensor.camera)
+        if earlier is None or scenario.period_us(sensor) < scenario.period_us(earlier):
             joined[sensor.camera] = sensor
     return tuple(joined.values())
 
@@ -331,7 +331,7 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
 
 
 def _parts(
-    own: Cell,
+    original: Cell,
     then: Cell,
     change: Change,
     fork: Cell,
@@ -343,10 +343,12 @@ def _parts(
     part is one object.
     """
     at_us = scenario.start_us + change.after_us
-    before = build_parts(own, options, scenario, threads, is_shown=True)
-    after = before if then == own else build_parts(then, options, scenario, threads, is_shown=True)
-    same_renderer = (then.renderer, then.seed) == (own.renderer, own.seed)
-    same_policy = (then.policy, then.seed) == (own.policy, own.seed)
+    before = build_parts(original, options, scenario, threads, is_shown=True)
+    after = (
+        before if then == original else build_parts(then, options, scenario, threads, is_shown=True)
+    )
+    same_renderer = (then.renderer, then.seed) == (original.renderer, original.seed)
+    same_policy = (then.policy, then.seed) == (original.policy, original.seed)
     next_policy = before.policy if same_policy else after.policy
     return RolloutParts(
         SwitchedRenderer(
@@ -365,16 +367,22 @@ def _check_replay(past: LoggedRollout, at_us: int, folder: Path) -> None:
     Raises:
         InfrastructureError: They differ before the instant.
     """
-    one = log_trace(past.folder)
-    other = log_trace(folder)
+    logged_trace = log_trace(past.folder)
+    replayed_trace = log_trace(folder)
     # Another policy may have more cameras; their frames before the instant have no logged
     # counterpart.
-    other = {key: value for key, value in other.items() if key in one or key[1] != "frames"}
+    replayed_trace = {
+        key: value
+        for key, value in replayed_trace.items()
+        if key in logged_trace or key[1] != "frames"
+    }
     # The pose at the instant follows from the original parts; its frames and its plan come from the
     # new ones.
     until = {"ego": at_us + 1, "actors": at_us + 1, "frames": at_us, "plans": at_us}
     step_us = past.scenario.rates.control_us
-    difference = first_difference(one, other, past.scenario.start_us, step_us, until)
+    difference = first_difference(
+        logged_trace, replayed_trace, past.scenario.start_us, step_us, until
+    )
     if difference is not None:
         (folder / MANIFEST).unlink()
         raise InfrastructureError(

@@ -210,15 +210,15 @@ def _rated(device: str, calls: dict[str, Callable[[], Call]]) -> Facts:
     """Return what calls cost at least and, on a card, their times and shares of its peak."""
     name = facts_of(device).get("card")
     facts: Facts = {"ok": True}
-    for what, make in calls.items():
-        work = COUNTED[what]
-        facts[what] = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
+    for call_name, make in calls.items():
+        work = COUNTED[call_name]
+        facts[call_name] = {**work._asdict(), "h100_least_ms": work.least_ms(H100)}
         if name is None:
             continue
         ms = median_ms(make())
-        known = name in PEAKS
-        share = round(work.least_ms(name) / ms, 3) if known else "not known for this card"
-        facts[what] |= {"ms": ms, "roofline_share": share}
+        has_peak = name in PEAKS
+        share = round(work.least_ms(name) / ms, 3) if has_peak else "not known for this card"
+        facts[call_name] |= {"ms": ms, "roofline_share": share}
     return facts
 
 
@@ -287,9 +287,9 @@ def _gradients(
     planes = torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], dim=2)
     planes.square().sum().backward()  # type: ignore[no-untyped-call]
     leaves = [part.grad for part in splats if part.grad is not None]
-    pairs, *found = download(out.pairs, *leaves)
+    pairs, *gradients = download(out.pairs, *leaves)
     if compositor is None or compositor.had_room(compositor.capacity, int(pairs)):
-        return [part.ravel() for part in found]
+        return [part.ravel() for part in gradients]
     return _gradients(cloud, camera, compositor)
 
 

@@ -22,7 +22,9 @@ from alpasim_plugin.core.types import (
     read_only,
 )
 
-ALPHA, DEPTH_M = 1.0, 1e6  # largest values of a frame's planes
+# Largest values of a frame's planes.
+ALPHA = 1.0
+DEPTH_M = 1e6
 ROUNDING = 1e-3
 CHECK = "simrun check policy finds all faults of a policy"
 
@@ -53,18 +55,18 @@ def checked_frames(
         return []
     kind = RendererError if is_own(renderer) else RendererFault
     name = f"{type(renderer).__name__}, camera {requests[0].camera.name!r} at {requests[0].t_us} us"
-    where = defined(renderer, "render")
-    shown = requests
+    location = defined(renderer, "render")
+    request_views = requests
     if not is_own(renderer):
-        shown = [replace(read_only(one), camera=read_only(one.camera)) for one in requests]
-    with blaming(kind, name, where, not is_own(renderer)):
-        frames = list(renderer.render_batch(shown))
+        request_views = [replace(read_only(one), camera=read_only(one.camera)) for one in requests]
+    with blaming(kind, name, location, not is_own(renderer)):
+        frames = list(renderer.render_batch(request_views))
     problem = f"{len(frames)} frames for {len(requests)} requests"
     if len(frames) == len(requests):
         problem = "; ".join(filter(None, map(_frame_problem, frames, requests)))
     if problem:
         raise kind(
-            f"{name}: {problem}{where}", "Correct the renderer; its contract is types.Frame."
+            f"{name}: {problem}{location}", "Correct the renderer; its contract is types.Frame."
         )
     return [
         replace(frame, events=(*frame.events, "black"))
@@ -122,9 +124,9 @@ def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:
     name = type(policy).__name__
     with blaming(PolicyError, f"{name}, its sensors", "", runs_users_code(policy, "act")):
         sensors = policy.sensors
-        found = sensors_problem(sensors)
-    if found:
-        raise PolicyError(f"{name}: {found}", CHECK)
+        problem = sensors_problem(sensors)
+    if problem:
+        raise PolicyError(f"{name}: {problem}", CHECK)
     return sensors
 
 
@@ -146,10 +148,10 @@ def checked_plan(policy: Policy, observation: Observation) -> Plan:
             does not start now.
     """
     name = f"{type(policy).__name__} at {observation.t_us} us"
-    where = defined(policy, "act")
-    with blaming(PolicyError, name, where, runs_users_code(policy, "act")):
+    location = defined(policy, "act")
+    with blaming(PolicyError, name, location, runs_users_code(policy, "act")):
         plan = policy.act(observation)
-        found = plan_problem(plan, observation.t_us)
-    if found:
-        raise PolicyError(f"{name}: {found}{where}", CHECK)
+        problem = plan_problem(plan, observation.t_us)
+    if problem:
+        raise PolicyError(f"{name}: {problem}{location}", CHECK)
     return plan

@@ -55,10 +55,10 @@ class LensRenderer(Renderer):
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Render the pinholes of all requests, and join those of each lens."""
         parts = [self._cover.requests(request) for request in requests]
-        frames = iter(self._inner.render_batch([part for some in parts for part in some]))
+        frames = iter(self._inner.render_batch([part for pinholes in parts for part in pinholes]))
         return [
-            self._cover.frame(request.camera.name, [next(frames) for _ in some])
-            for request, some in zip(requests, parts, strict=True)
+            self._cover.frame(request.camera.name, [next(frames) for _ in pinholes])
+            for request, pinholes in zip(requests, parts, strict=True)
         ]
 
     def recorded(self) -> Sequence[RecordedFrame]:

@@ -97,7 +97,7 @@ def run_jobs(
     workers: int,
     threads: int = 1,
     limit_s: float | None = None,
-    known: Callable[[J], R | None] = lambda job: None,
+    stored_result: Callable[[J], R | None] = lambda job: None,
     parts_of: Callable[[J], str] = lambda job: "",
 ) -> Iterator[tuple[J, R | Lost]]:
     """Yield every job with its result, as they finish; results do not depend on the workers.
@@ -111,7 +111,7 @@ def run_jobs(
             process.
         threads: Threads of each worker, for numerical libraries.
         limit_s: Seconds that one job may take before its worker is ended; None: no limit.
-        known: Returns the result of a job whose worker died, if it was finished before.
+        stored_result: Returns the result of a job whose worker died, if it was finished before.
         parts_of: Names the parts of the user's that a job calls; empty where it calls none.
 
     Raises:
@@ -132,7 +132,7 @@ def run_jobs(
             warn(f"warning: a worker process ended; {len(victims)} jobs run again, one at a time")
         pool.workers = 1
         for job in victims:
-            before = known(job)
+            before = stored_result(job)
             if before is None:
                 yield from pool.results([job])
             else:

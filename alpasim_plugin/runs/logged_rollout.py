@@ -93,18 +93,20 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
     # fixer.
     has_fixer = resolve_renderer(row.renderer, options.fixer).fixer is not None
-    own = replace(options, fixer=overrides_of(row.renderer, options.fixer) if has_fixer else ())
-    plan = make_plan([ref], [row.renderer], [row.policy], [row.seed], own)
+    rollout_options = replace(
+        options, fixer=overrides_of(row.renderer, options.fixer) if has_fixer else ()
+    )
+    plan = make_plan([ref], [row.renderer], [row.policy], [row.seed], rollout_options)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row.scene)
     if loaded is None or cell.rollout_key != manifest["rollout_key"]:
-        what = (
+        difference = (
             f"scenario {ref.path} now has the scene id {cell.scene!r}"
             if loaded is None
             else "content key differs"
         )
         raise InputError(
-            f"{name}: {what}: the scenario, a part or the version has changed since the log was written",
+            f"{name}: {difference}: the scenario, a part or the version has changed since the log was written",
             "Run the rollout again.",
         )
     return LoggedRollout(root, cell, options, loaded, manifest)
@@ -116,12 +118,12 @@ def named_rollout(rollouts: Sequence[Rollout], name: str) -> Rollout:
     Raises:
         InputError: The run has no such rollout.
     """
-    by_name = {cell_name(*rollout.cell): rollout for rollout in rollouts}
+    by_name = {cell_name(*row.cell): row for row in rollouts}
     wanted = name.strip("/")
-    by_folder = {rollout.path.removeprefix("rollouts/"): rollout for rollout in rollouts}
-    found = by_name.get(wanted) or by_folder.get(wanted.removeprefix("rollouts/"))
-    if found is None:
+    by_folder = {row.path.removeprefix("rollouts/"): row for row in rollouts}
+    rollout = by_name.get(wanted) or by_folder.get(wanted.removeprefix("rollouts/"))
+    if rollout is None:
         near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
         do_this = f"Did you mean {' or '.join(near)}?" if near else "Name a run that has rollouts."
         raise InputError(f"{name}: the run has no such rollout among its {len(rollouts)}", do_this)
-    return found
+    return rollout

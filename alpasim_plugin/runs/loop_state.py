@@ -46,14 +46,14 @@ from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig
 
 
-def drawn(actors: Mapping[str, F64]) -> Mapping[str, F64]:
+def visible_actors(actors: Mapping[str, F64]) -> Mapping[str, F64]:
     """Return the poses of the actors that are drawn, as views that cannot be written: what stands
     in a reconstruction is in its images already.
     """
-    shown = {name: T.view() for name, T in actors.items() if not name.startswith(STANDING_ID)}
-    for T in shown.values():
+    poses = {name: T.view() for name, T in actors.items() if not name.startswith(STANDING_ID)}
+    for T in poses.values():
         T.flags.writeable = False
-    return shown
+    return poses
 
 
 @dataclass
@@ -269,11 +269,11 @@ class Forecast:
             self.history.t_us[:upto], self.history.xyz[:upto], self.history.quat[:upto]
         )
         period_us = self.scenario.rates.control_us
-        shown = drawn(self.actors.at(t_us))
-        before = drawn(self.actors.at(t_us - period_us)) if camera.shutter_us else {}
-        exposure = rolling_exposure(camera, before, shown, period_us)
+        actor_poses = visible_actors(self.actors.at(t_us))
+        before = visible_actors(self.actors.at(t_us - period_us)) if camera.shutter_us else {}
+        exposure = rolling_exposure(camera, before, actor_poses, period_us)
         T_world_camera = shutter_poses(past, camera, t_us)
-        return RenderRequest(t_us, camera, T_world_camera, shown, exposure=exposure)
+        return RenderRequest(t_us, camera, T_world_camera, actor_poses, exposure=exposure)
 
     def _extend(self, to_us: int) -> None:
         states = []

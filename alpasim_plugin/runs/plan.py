@@ -95,9 +95,8 @@ class Cell:
     score_key: str  # digest of rollout_key and of everything that determines the scores
     # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
     stops_at_path_end: bool = True
-    undigested: tuple[
-        str, ...
-    ] = ()  # parts without a digest (remote services): the rollout is reused on request only
+    # parts without a digest (remote services): the rollout is reused on request only
+    undigested: tuple[str, ...] = ()
 
     @property
     def folder(self) -> Path:
@@ -120,7 +119,7 @@ class RunPlan:
     """A resolved run.
 
     Attributes:
-        asked: The scenarios as the command named them: files, folders, suites; in no key.
+        scenario_names: The scenarios as the command named them: files, folders, suites; in no key.
         question: Digest of a question that decides which of the rollouts are driven; empty where all
             are.
         whole: The plan that this is a part of, whose keys it bears; see `part_of`.
@@ -132,7 +131,7 @@ class RunPlan:
     policies: tuple[PartSpec, ...]
     seeds: tuple[int, ...]
     options: RunOptions
-    asked: tuple[str, ...] = ()
+    scenario_names: tuple[str, ...] = ()
     question: str = ""
     whole: RunPlan | None = None
 
@@ -162,13 +161,13 @@ class RunPlan:
     @property
     def parts(self) -> tuple[PartSpec, ...]:
         """Give every part that the run builds, each once."""
-        found = [
+        parts = [
             part
             for cell in self.cells
             for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)
         ]
-        found += [part for cell in self.cells[:1] for part in cell.evaluators]
-        return tuple({(part.kind, part.name): part for part in found if part is not None}.values())
+        parts += [part for cell in self.cells[:1] for part in cell.evaluators]
+        return tuple({(part.kind, part.name): part for part in parts if part is not None}.values())
 
     @property
     def undigested(self) -> tuple[str, ...]:
@@ -192,22 +191,8 @@ def make_plan(
         InfrastructureError: The device is not here.
     """
     options = replace(options, device=require_device(options.device))
-    for what, values in (("renderer", renderers), ("policy", policies), ("seed", seeds)):
-        if not values:
-            raise InputError(f"no {what} is named", f"Name at least one {what}.")
-        for value, count in Counter(values).items():
-            if count > 1:
-                raise InputError(
-                    f"{what} {value} is named {count} times", f"Name every {what} once."
-                )
-    rendering = tuple(resolve_renderer(name, options.fixer) for name in renderers)
-    same = [str(spec) for spec in rendering]
-    if len(set(same)) != len(same):
-        raise InputError(
-            f"renderers {list(renderers)}: they resolve to {same}",
-            "name every renderer once",
-        )
-    _check_fixer_settings(options.fixer, renderers, rendering)
+    _check_names({"renderer": renderers, "policy": policies, "seed": seeds})
+    rendering = _resolve_renderers(renderers, options.fixer)
     driving = tuple(resolve("policy", name) for name in policies)
     moving = {
         spec.name: resolve("controller", options.controller or spec.controller) for spec in driving
@@ -227,12 +212,8 @@ def make_plan(
             controller = moving[policy.name]
             if controller.name == "perfect":
                 make_controller(controller.name, scenario.vehicle)  # refuses friction
-            parts = {
-                f"renderer {renderer.name}": renderer.digest,
-                f"policy {policy.name}": policy.digest,
-                f"controller {controller.name}": controller.digest,
-                f"source of {scenario.scene_id}": sources[scenario.source_part],
-            }
+            parts = _part_digests(renderer, policy, controller)
+            parts[f"source of {scenario.scene_id}"] = sources[scenario.source_part]
             made_of = parts | {
                 SIMRUN: loop,
                 f"scene {scenario.scene_id}": scenario.content_hash,
@@ -259,6 +240,53 @@ def make_plan(
                 )
             )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def _check_names(names_by_kind: Mapping[str, Sequence[object]]) -> None:
+    """Refuse a kind of which nothing is named, or one thing twice.
+
+    Raises:
+        InputError: Naming the kind.
+    """
+    for kind, names in names_by_kind.items():
+        if not names:
+            raise InputError(f"no {kind} is named", f"Name at least one {kind}.")
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise InputError(
+                    f"{kind} {name} is named {count} times", f"Name every {kind} once."
+                )
+
+
+def _resolve_renderers(
+    names: Sequence[str], fixer_settings: Sequence[str]
+) -> tuple[RendererSpec, ...]:
+    """Resolve the renderers of a run.
+
+    Raises:
+        InputError: A name is invalid, two resolve to the same renderer, or a fixer's setting is of
+            no renderer.
+    """
+    specs = tuple(resolve_renderer(name, fixer_settings) for name in names)
+    labels = [str(spec) for spec in specs]
+    if len(set(labels)) != len(labels):
+        raise InputError(
+            f"renderers {list(names)}: they resolve to {labels}",
+            "name every renderer once",
+        )
+    _check_fixer_settings(fixer_settings, names, specs)
+    return specs
+
+
+def _part_digests(
+    renderer: RendererSpec, policy: PartSpec, controller: PartSpec
+) -> dict[str, str | None]:
+    """Return the digests of a rollout's parts, by kind and name."""
+    return {
+        f"renderer {renderer.name}": renderer.digest,
+        f"policy {policy.name}": policy.digest,
+        f"controller {controller.name}": controller.digest,
+    }
 
 
 def _check_fixer_settings(

@@ -53,7 +53,7 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
 
 
 def check_policies(
-    plan: RunPlan, known: JsonView, how: HowToRun, noticed: Callable[[str], None]
+    plan: RunPlan, earlier_checks: JsonView, how: HowToRun, noticed: Callable[[str], None]
 ) -> JsonObject:
     """Return what `policies.conformance.check_policy` finds in each policy of the user's own: its
     digest, and by ``breaches`` and ``notes`` a name and a sentence each.
@@ -63,8 +63,8 @@ def check_policies(
 
     Args:
         plan: The run.
-        known: What an earlier command of the run found; a policy of the same digest is not checked
-            again.
+        earlier_checks: What an earlier command of the run found; a policy of the same digest is not
+            checked again.
         how: Workers and the time limit of a rollout.
         noticed: Called with one line for each breach.
 
@@ -74,12 +74,12 @@ def check_policies(
     """
     shipped = {part.target for part in entries("policy").values() if part.is_shipped}
     scenarios = list(plan.scenarios.values())
-    found: JsonObject = {}
+    checks: JsonObject = {}
     todo = []
     for policy in plan.policies:
-        before = known.get(policy.name)
+        before = earlier_checks.get(policy.name)
         if policy.digest is not None and before and before["digest"] == policy.digest:
-            found[policy.name] = before
+            checks[policy.name] = before
         elif policy.target in shipped:
             frames_asked(policy, scenarios)
         elif policy.address is None:
@@ -94,16 +94,19 @@ def check_policies(
             result = _of_lost(result, limit_s)
         if isinstance(result, InputError):
             raise result
-        found[policy.name] = {"digest": policy.digest, **result}
+        checks[policy.name] = {"digest": policy.digest, **result}
     unmade = [
-        text for one in found.values() for name, text in one["breaches"] if name in NEVER_DRIVES
+        text
+        for facts in checks.values()
+        for name, text in facts["breaches"]
+        if name in NEVER_DRIVES
     ]
     if len(unmade) == len(plan.policies):
         raise PolicyError(unmade[0], "Correct the policy; nothing was driven.")
     for policy in todo:
-        for _, sentence in found[policy.name]["breaches"]:
+        for _, sentence in checks[policy.name]["breaches"]:
             noticed(f"check of {policy.name}: {sentence}")
-    return found
+    return checks
 
 
 def hanging(checks: JsonView) -> dict[str, str]:
@@ -112,8 +115,8 @@ def hanging(checks: JsonView) -> dict[str, str]:
     """
     return {
         policy: sentence
-        for policy, found in checks.items()
-        for name, sentence in found["breaches"]
+        for policy, check in checks.items()
+        for name, sentence in check["breaches"]
         if name == HANGS
     }
 

@@ -46,13 +46,13 @@ def versions() -> dict[str, str]:
     """Return the versions of Python and of the libraries that affect results, or "not
     installed".
     """
-    found = {"alpasim-onefixer": __version__, "python": platform.python_version()}
+    version_by_name = {"alpasim-onefixer": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
-            found[package] = version(package)
+            version_by_name[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            version_by_name[package] = "not installed"
+    return version_by_name
 
 
 def hardware() -> JsonObject:
@@ -125,8 +125,8 @@ def project(folder: Path | None = None) -> Project:
     except subprocess.TimeoutExpired:
         return _without(f"git did not answer in {PATIENCE_S:g} s")
     except subprocess.CalledProcessError as error:
-        said = str(error.stderr or "").strip().splitlines()
-        return _without(said[0] if said else f"git ended with {error.returncode}")
+        error_lines = str(error.stderr or "").strip().splitlines()
+        return _without(error_lines[0] if error_lines else f"git ended with {error.returncode}")
     return {"commit": commit, "dirty": bool(state.strip()), "reason": ""}
 
 
@@ -136,8 +136,10 @@ def _without(reason: str) -> Project:
 
 def _git(folder: Path | None, *words: str) -> str:
     """Return what git prints; its errors are raised."""
-    asked = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=PATIENCE_S)
-    return str(asked([*GIT, *words], cwd=folder, env=os.environ | ALONE).stdout)
+    run_git = partial(
+        subprocess.run, capture_output=True, text=True, check=True, timeout=PATIENCE_S
+    )
+    return str(run_git([*GIT, *words], cwd=folder, env=os.environ | ALONE).stdout)
 
 
 def _no_filters(folder: Path | None) -> list[str]:
@@ -217,8 +219,8 @@ def _fixer_facts(rollouts: Sequence[JsonObject]) -> FixerFacts:
 
 def _largest(errors: Iterable[dict[str, float | None]]) -> dict[str, float | None]:
     """Return the largest of each kind of error over rollouts; None where there is none."""
-    found: dict[str, list[float]] = {}
-    for one in errors:
-        for name, value in one.items():
-            found.setdefault(name, []).extend([] if value is None else [value])
-    return {name: max(values, default=None) for name, values in found.items()}
+    values_by_kind: dict[str, list[float]] = {}
+    for rollout_errors in errors:
+        for name, value in rollout_errors.items():
+            values_by_kind.setdefault(name, []).extend([] if value is None else [value])
+    return {name: max(values, default=None) for name, values in values_by_kind.items()}

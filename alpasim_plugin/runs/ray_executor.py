@@ -115,14 +115,7 @@ def run_on_ray(
             differs from this machine.
     """
     with connected(executor.address) as ray:
-        needs = {"CPU": executor.cores, "GPU": executor.gpus, "memory": executor.memory_gib * GIB}
-        held = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(all(one.get(name, 0) >= need for name, need in needs.items()) for one in held):
-            raise InfrastructureError(
-                f"--executor {executor}: no node has {executor.cores} cores, {executor.gpus:g} "
-                f"GPUs and {executor.memory_gib:g} GiB",
-                "ask for less behind --executor, or add nodes",
-            )
+        _require_node(ray, executor)
         drive = ray.remote(drive_on_node).options(
             num_cpus=executor.cores,
             num_gpus=executor.gpus,
@@ -153,6 +146,22 @@ def run_on_ray(
         finally:
             for task in running:
                 ray.cancel(task, force=True)
+
+
+def _require_node(ray: Any, executor: Executor) -> None:
+    """Refuse a cluster in which no node has what a rollout needs.
+
+    Raises:
+        InfrastructureError: Naming the needs.
+    """
+    needs = {"CPU": executor.cores, "GPU": executor.gpus, "memory": executor.memory_gib * GIB}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(all(node.get(name, 0) >= need for name, need in needs.items()) for node in nodes):
+        raise InfrastructureError(
+            f"--executor {executor}: no node has {executor.cores} cores, {executor.gpus:g} "
+            f"GPUs and {executor.memory_gib:g} GiB",
+            "ask for less behind --executor, or add nodes",
+        )
 
 
 def _result(ray: Any, task: Any, root: Path) -> JsonObject | Lost:
@@ -208,12 +217,12 @@ def drive_on_node(
 
 def identity_of(parts: Sequence[PartSpec]) -> dict[str, str]:
     """Return what must be the same on all machines of a run: name -> version or digest."""
-    own = {}
+    part_digests = {}
     for part in parts:
         if part.target.partition(".")[0] not in OWN_PACKAGES:
-            own[f"code of {part.target}"] = _code_of(part.target)
-        own |= {path: _sha256_of(path) for path in part.files}
-    return versions() | {"code of simrun": package_digest()[:12]} | own
+            part_digests[f"code of {part.target}"] = _code_of(part.target)
+        part_digests |= {path: _sha256_of(path) for path in part.files}
+    return versions() | {"code of simrun": package_digest()[:12]} | part_digests
 
 
 def _code_of(target: str) -> str:

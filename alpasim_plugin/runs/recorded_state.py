@@ -6,9 +6,8 @@ import numpy.typing as npt
 from alpasim_plugin.core.geometry import heading_of, interpolate, wrap_angle
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
-DIFFERENCE_US = (
-    100_000  # half window of the differences: long enough to bridge the noise of 200 Hz poses
-)
+# half window of the differences: long enough to bridge the noise of 200 Hz poses
+DIFFERENCE_US = 100_000
 
 
 def ego_state_from_log(ego_log: Trajectory, t_us: int, vehicle: Vehicle) -> EgoState:

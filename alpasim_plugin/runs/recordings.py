@@ -90,18 +90,11 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
     labels: list[str] = []
     items: list[Item] = []
     for rollout in cell.rollouts:
-        log = logs.get(rollout.path)
-        if isinstance(log, SimrunError):
-            raise log
+        log = _usable_log(cell, rollout, logs)
         if log is None:
             if rollout.ok:
                 notes.append(f"{rollout.renderer}: its log is not there, so it is left out")
             continue
-        if int(log.ego.t_us[0]) < 0:
-            raise InputError(
-                f"{cell.name}, {rollout.renderer}: times before zero",
-                "Give a log whose clock begins at zero or later.",
-            )
         color = RENDERER_COLORS[len(recorded) % len(RENDERER_COLORS)]
         label = _label(rollout.renderer, labels)
         recorded.append(log)
@@ -133,6 +126,24 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
         "channels": counts,
         "notes": notes,
     }
+
+
+def _usable_log(cell: WatchedCell, rollout: Rollout, logs: Logs) -> RolloutLog | None:
+    """Return the log of a rollout; None where there is none.
+
+    Raises:
+        SimrunError: The log could not be read.
+        InputError: It has an instant before zero.
+    """
+    log = logs.get(rollout.path)
+    if isinstance(log, SimrunError):
+        raise log
+    if log is not None and int(log.ego.t_us[0]) < 0:
+        raise InputError(
+            f"{cell.name}, {rollout.renderer}: times before zero",
+            "Give a log whose clock begins at zero or later.",
+        )
+    return log
 
 
 def _write(path: Path, items: Iterable[Item], facts: Mapping[str, str]) -> dict[str, int]:
@@ -203,16 +214,16 @@ def _map_item(content: JsonView, recorded: F64, t_us: int) -> Item:
         "crosswalk": [[*ring, ring[0]] for ring in content["crosswalks"]],
     }
     entities = []
-    for kind, lines in flat.items():
-        unique = {str(line): line for line in lines if len(line) >= 2}  # lanes share borders
-        drawn = []
+    for kind, polylines in flat.items():
+        unique = {str(line): line for line in polylines if len(line) >= 2}  # lanes share borders
+        lines = []
         for line in unique.values():
             xy = np.array(line)[:, :2]
             squared_m2 = ((xy[:, None] - recorded[None, :, :2]) ** 2).sum(axis=2)
             xyz = np.column_stack([xy, recorded[squared_m2.argmin(axis=1), 2]])
-            drawn.append(_line(xyz, MAP_COLORS[kind], THIN_M))
-        if drawn:
-            entities.append(_entity(t_us, kind, lines=drawn))
+            lines.append(_line(xyz, MAP_COLORS[kind], THIN_M))
+        if lines:
+            entities.append(_entity(t_us, kind, lines=lines))
     path = _line(recorded, MAP_COLORS["recorded drive"], THIN_M)
     entities.append(_entity(t_us, "recorded drive", lines=[path]))
     return _update(t_us, "/map", entities)

@@ -64,8 +64,8 @@ class ImageFolderReader:
         for index, name in enumerate(self.names):
             image = self._read(name)
             if image.shape[:2] != (self.format.height, self.format.width):
-                found = f"{name} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
-                raise self._refusal(found, "give images of one size")
+                problem = f"{name} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
+                raise self._refusal(problem, "give images of one size")
             yield TimedFrame(image, index, 1)
 
     def _read(self, name: str) -> U8:
@@ -84,8 +84,8 @@ class ImageFolderReader:
             )
         return cv2.cvtColor(image, kind)
 
-    def _refusal(self, found: str, do: str) -> InputError:
-        return InputError(f"{self.path}: {found}", do)
+    def _refusal(self, problem: str, do: str) -> InputError:
+        return InputError(f"{self.path}: {problem}", do)
 
 
 class ImageFolderWriter:
@@ -249,11 +249,13 @@ def refine_video(
             stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer, limit):
-            for timed, given, fixed in zip(timing, block.given, block.fixed, strict=True):
+            for timed, source_frame, fixed in zip(timing, block.given, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
                 if "compare" in writers:
                     writers["compare"].write(
-                        np.concatenate([given.rgb, fixed.rgb], axis=1), timed.time, timed.duration
+                        np.concatenate([source_frame.rgb, fixed.rgb], axis=1),
+                        timed.time,
+                        timed.duration,
                     )
             timing.clear()
             stats.add(block)
@@ -345,25 +347,30 @@ def check_formats(readers: Mapping[str, Reader]) -> None:
     """
     source = readers["input"].format
     for role, reader in readers.items():
-        mine = reader.format
+        role_format = reader.format
         if type(reader) is not type(readers["input"]):
             raise InputError(
                 f"{reader.path}: the {role} is a {_form(reader)}, the input a {_form(readers['input'])}",
                 "give both as videos, or both as folders of PNG",
             )
-        if (mine.width, mine.height) != (source.width, source.height):
+        if (role_format.width, role_format.height) != (source.width, source.height):
             raise InputError(
-                f"{reader.path}: the {role} is {mine.width}x{mine.height}, the input {source.width}x{source.height}",
+                f"{reader.path}: the {role} is {role_format.width}x{role_format.height}, the input {source.width}x{source.height}",
                 "give both at one size",
             )
-        if mine.frames and source.frames and mine.frames != source.frames:
+        if role_format.frames and source.frames and role_format.frames != source.frames:
             raise _lengths_differ(
-                role, reader.path, f"{mine.frames} frames, the input {source.frames}"
+                role, reader.path, f"{role_format.frames} frames, the input {source.frames}"
             )
         several = (source.frames or 2) > 1  # a single frame has no rate
-        if several and mine.rate and source.rate and abs(mine.rate / source.rate - 1) > SAME_RATE:
+        if (
+            several
+            and role_format.rate
+            and source.rate
+            and abs(role_format.rate / source.rate - 1) > SAME_RATE
+        ):
             raise InputError(
-                f"{reader.path}: the {role} has {float(mine.rate):.3f} frames per second, the input {float(source.rate):.3f}",
+                f"{reader.path}: the {role} has {float(role_format.rate):.3f} frames per second, the input {float(source.rate):.3f}",
                 "give both at one frame rate",
             )
 
@@ -400,12 +407,12 @@ def _joined(
                     f"{readers[role].path}: frame {index} of the {role} comes {float(time_s):.3f} s after its first, the input's {float(times_s['input']):.3f} s",
                     "give videos of the same frames at the same times",
                 )
-        given = dict(zip(roles, row, strict=True))
-        timed = given["input"]
+        frames_by_role = dict(zip(roles, row, strict=True))
+        timed = frames_by_role["input"]
         timing.append(timed)
         alpha = None
-        if "opacity" in given:
-            image = given["opacity"].image
+        if "opacity" in frames_by_role:
+            image = frames_by_role["opacity"].image
             sample = image[::8, ::8].astype(np.int16)
             if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
                 raise InputError(
@@ -413,7 +420,7 @@ def _joined(
                     "give the accumulated opacity as a grey video, white where the input is reliable",
                 )
             alpha = image[..., 1].astype(np.float32) / np.float32(255)
-        sdmap = given["sdmap"].image if "sdmap" in given else None
+        sdmap = frames_by_role["sdmap"].image if "sdmap" in frames_by_role else None
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
 
 

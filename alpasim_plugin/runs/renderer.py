@@ -42,12 +42,12 @@ def make_renderer(
     require_kernels()
     spec = resolve_renderer(name, overrides) if isinstance(name, str) else name
     cover = LensCover(scenario.cameras)
-    drawn = cover.drawn(scenario)
+    pinhole_scenario = cover.drawn(scenario)
     session = {"seed": seed, "device": device, "threads": threads}
-    built: Renderer = build(spec.base, scenario=drawn, **session)
+    built: Renderer = build(spec.base, scenario=pinhole_scenario, **session)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
 
-    base = in_weather(built, drawn, seed)
+    base = in_weather(built, pinhole_scenario, seed)
     if spec.fixer is None:
         has_lens = any(camera.lens is not None for camera in scenario.cameras)
         return LensRenderer(base, cover) if has_lens else base

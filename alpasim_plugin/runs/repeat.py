@@ -55,8 +55,8 @@ def repeat_rollout(
     shortest = {cell.policy.name: cell for cell in longest_first}
     if not shortest:
         return _not_compared("no rollout with a fixed latency has finished")
-    found = [_driven_twice(plan, root, cell, threads) for cell in shortest.values()]
-    return min(found, key=lambda result: (False, None, True).index(result["repeatable"]))
+    comparisons = [_driven_twice(plan, root, cell, threads) for cell in shortest.values()]
+    return min(comparisons, key=lambda result: (False, None, True).index(result["repeatable"]))
 
 
 def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonObject:

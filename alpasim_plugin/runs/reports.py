@@ -108,28 +108,28 @@ def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
         }
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.message}"}
-    one, other = logs.values()
-    if not one.plans or not other.plans:
+    first_log, second_log = logs.values()
+    if not first_log.plans or not second_log.plans:
         return {"t_us": None, "reason": "a log without plans"}
-    found = first_divergence(one.plans, other.plans)
-    if found is None:
+    divergence = first_divergence(first_log.plans, second_log.plans)
+    if divergence is None:
         return {"t_us": None, "reason": f"the plans never diverge by more than {DIVERGED_M} m"}
-    divergence: JsonObject = {
-        "t_us": found.t_us,
-        "after_us": found.t_us - one.render_start_us,
-        "gap_m": round(found.gap_m, 4),
+    facts: JsonObject = {
+        "t_us": divergence.t_us,
+        "after_us": divergence.t_us - first_log.render_start_us,
+        "gap_m": round(divergence.gap_m, 4),
     }
     frames = {
-        side: _image(root, log, found.t_us, f"{name}-{i}.jpg")
+        side: _image(root, log, divergence.t_us, f"{name}-{i}.jpg")
         for i, (side, log) in enumerate(logs.items())
     }
     if None in frames.values():
-        divergence["frames_reason"] = (
+        facts["frames_reason"] = (
             "a log without camera images (--images none, or a policy without cameras)"
         )
-    return divergence | {
+    return facts | {
         "source": "logs",
-        "ahead_us": found.ahead_us,
+        "ahead_us": divergence.ahead_us,
         "frames": {side: path for side, path in frames.items() if path},
     }
 
@@ -138,10 +138,10 @@ def _image(root: Path, log: RolloutLog, t_us: int, name: str) -> str | None:
     """Save the cameras' newest frames at a query and return their path; None where the log has
     none.
     """
-    shown = shown_at(log, t_us)
-    if shown is None:
+    image = shown_at(log, t_us)
+    if image is None:
         return None
-    write_bytes(root / name, encode_image(shown, "jpeg", 85))
+    write_bytes(root / name, encode_image(image, "jpeg", 85))
     return name
 
 
@@ -151,7 +151,9 @@ def shown_at(log: RolloutLog, t_us: int) -> U8 | None:
     """
     newest = {image.camera: image for image in log.images if image.end_us <= t_us}
     images = [
-        smaller(decode_image(one.data, f"camera {one.camera!r} at {one.end_us} us"), IMAGE_WIDTH)
-        for one in newest.values()
+        smaller(
+            decode_image(frame.data, f"camera {frame.camera!r} at {frame.end_us} us"), IMAGE_WIDTH
+        )
+        for frame in newest.values()
     ]
     return beside(images) if images else None

@@ -149,8 +149,8 @@ def default_folder(plan: RunPlan) -> Path:
     """Return the default run folder: what the command named first, and a short key of the command;
     the whole key where another command has the short one.
     """
-    asked = Path(plan.asked[0] if plan.asked else next(iter(plan.scenarios)))
-    name = slug(asked.stem or real(asked).stem)
+    first_name = Path(plan.scenario_names[0] if plan.scenario_names else next(iter(plan.scenarios)))
+    name = slug(first_name.stem or real(first_name).stem)
     key = plan.command_key
     short = Path("runs", f"{name}-{key[:SHORT_KEY]}")
     try:
@@ -199,9 +199,9 @@ def execute_run(
         how = HowToRun(threads, resume, limit_s, executor)
         if executor.is_local and (threads.workers > 1 or any(map(users_parts, plan.cells))):
             prepare_workers(threads.per_worker)
-        known = held.get("policy_checks") or {}
+        earlier_checks = held.get("policy_checks") or {}
         try:
-            checks = check_policies(plan, known, how, progress.noticed)
+            checks = check_policies(plan, earlier_checks, how, progress.noticed)
             manifests = execute(
                 plan, root, how, on_done(progress), progress.noticed, held, hanging(checks)
             )
@@ -211,8 +211,8 @@ def execute_run(
                 "policy_checks": checks,
             }
             if repeat:
-                more["repeat"] = repeat_rollout(plan, root, manifests, how.cores_here)
-            store_same_poses(plan, root, manifests, how.cores_here)
+                more["repeat"] = repeat_rollout(plan, root, manifests, how.local_cores)
+            store_same_poses(plan, root, manifests, how.local_cores)
         finally:
             end_children()
         summary = finish_run(root, manifests, more, report)
@@ -271,7 +271,8 @@ def finish_run(
         report: Write ``report.html``.
     """
     info = read_run_json(root) | dict(more)
-    info["outcome"] = {  # for lists of many runs
+    # for lists of many runs
+    info["outcome"] = {
         "n_rollouts": len(manifests),
         "n_failed": sum(manifest["status"] != "ok" for manifest in manifests),
     }
@@ -351,7 +352,7 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
         {"schema_version": SCHEMA_VERSION, "key": plan.command_key, "content": plan.content}
         | origin_of(command)
         | {
-            "asked": list(plan.asked),
+            "asked": list(plan.scenario_names),
             "config": asdict(plan.options)
             | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
             "preset": plan.options.preset,

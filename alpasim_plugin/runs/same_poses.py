@@ -55,15 +55,17 @@ def store_same_poses(
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
         failed_us = int((first_failure(manifest) or {})["t_us"])
-        shown: dict[str, list[tuple[int, str]]] = {}
+        images_by_renderer: dict[str, list[tuple[int, str]]] = {}
         for spec in plan.renderers:
             if spec.name != cell.renderer.name:
                 users = [part for part in (spec.base, spec.fixer) if part and part.is_users]
                 work = partial(_images, plan, cell, log=log, failed_us=failed_us, threads=threads)
-                shown[spec.name] = []
+                images_by_renderer[spec.name] = []
                 with suppress(SimrunError):  # its own rollouts show the error
-                    shown[spec.name] = apart(work, spec, spec.name if users else "", threads)
-        images = {name: images for name, images in shown.items() if images}
+                    images_by_renderer[spec.name] = apart(
+                        work, spec, spec.name if users else "", threads
+                    )
+        images = {name: images for name, images in images_by_renderer.items() if images}
         write_json(path, {"key": key, "images": images})
 
 

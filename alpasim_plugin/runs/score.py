@@ -121,25 +121,26 @@ def _aggregate(
 
     An error of the scene score leaves the values of the rollouts.
     """
-    good = [one.manifest for one in scores if one.scored is not None]
+    good = [log_score.manifest for log_score in scores if log_score.scored is not None]
     has_images = any(manifest["frames"] for manifest in good)
-    failed = [one.manifest for one in scores if one.scored is None]
+    failed = [log_score.manifest for log_score in scores if log_score.scored is None]
     reduced = []
     marks: dict[int, SceneScore] | None = {}
     error: EvaluatorError | None = None
     try:
         if has_images:
-            reduced = reduce_run([one.scored for one in scores if one.scored is not None], preset)
+            scored = [log_score.scored for log_score in scores if log_score.scored is not None]
+            reduced = reduce_run(scored, preset)
         marks = {
-            number: scene_score(one.values, settings.scene_score)
-            for number, one in enumerate(reduced)
-            if settings.scene_score.enabled and not one.dropped
+            number: scene_score(rollout.values, settings.scene_score)
+            for number, rollout in enumerate(reduced)
+            if settings.scene_score.enabled and not rollout.dropped
         }
     except EvaluatorError as caught:
         error = caught
         marks = None
-    for number, (manifest, one) in enumerate(zip(good, reduced, strict=False)):
-        values = dict(one.reduction.values)
+    for number, (manifest, rollout) in enumerate(zip(good, reduced, strict=False)):
+        values = dict(rollout.reduction.values)
         mark = (marks or {}).get(number)
         if mark is not None:
             metric = METRICS["scene_score"]
@@ -174,10 +175,14 @@ def _write_aggregate(
     settings: EvalSettings,
 ) -> list[str]:
     """Write AlpaSim's files and return their names; without ``marks`` no summary."""
-    own = [one.of for one in reduced]
+    scored_rollouts = [one.of for one in reduced]
     sweeps = over_sweeps(reduced)
-    write_parquet(folder / "metrics_unprocessed.parquet", metrics_unprocessed_table(own))
-    write_parquet(folder / "metrics_results.parquet", metrics_results_table(sweeps, own))
+    write_parquet(
+        folder / "metrics_unprocessed.parquet", metrics_unprocessed_table(scored_rollouts)
+    )
+    write_parquet(
+        folder / "metrics_results.parquet", metrics_results_table(sweeps, scored_rollouts)
+    )
     files = ["metrics_unprocessed.parquet", "metrics_results.parquet"]
     if marks is None:
         return files
@@ -186,7 +191,7 @@ def _write_aggregate(
             "clipgt_id": manifest["scene"],
             "rollout_id": manifest["rollout"],
             "run_uuid": None,
-            "run_name": own[0].run_name,
+            "run_name": scored_rollouts[0].run_name,
             "error": manifest["error"]["message"],
         }
         for manifest in failed
@@ -207,15 +212,15 @@ def _write_info(
     metrics: MetricTable,
 ) -> None:
     used = {
-        one.manifest["scene"]: scenes.of(one.manifest["scene"])
-        for one in scores
-        if one.scored is not None
+        log_score.manifest["scene"]: scenes.of(log_score.manifest["scene"])
+        for log_score in scores
+        if log_score.scored is not None
     }
     for scene in used.values():
         write_scene(root, scene)
 
     def names(column: str) -> list[Any]:
-        return list(dict.fromkeys(one.manifest[column] for one in scores))
+        return list(dict.fromkeys(log_score.manifest[column] for log_score in scores))
 
     write_run_json(
         root,
@@ -235,17 +240,17 @@ def _write_info(
             "logs": names("log"),
             "scenes": {
                 name: {
-                    "source": one.source,
-                    "content_hash": one.content_hash,
-                    "notes": list(one.notes),
+                    "source": scene.source,
+                    "content_hash": scene.content_hash,
+                    "notes": list(scene.notes),
                 }
-                for name, one in used.items()
+                for name, scene in used.items()
             },
             "code": {"scoring": package_digest()[:12]},
             "metrics": metrics.as_dict(),
             "weights": {},
             "hardware": hardware(),
             "versions": versions(),
-            "left_out": sorted({note for one in used.values() for note in one.notes}),
+            "left_out": sorted({note for scene in used.values() for note in scene.notes}),
         },
     )

@@ -55,7 +55,7 @@ def find_logs(items: Sequence[str]) -> list[Path]:
     Raises:
         InputError: An item names no log.
     """
-    found: dict[Path, Path] = {}
+    logs_by_path: dict[Path, Path] = {}
     for item in items:
         path = Path(item)
         paths = (
@@ -73,18 +73,18 @@ def find_logs(items: Sequence[str]) -> list[Path]:
                 for log in ([hit] if os.path.isfile(hit) else sorted(hit.rglob("*.asl")))
             ]
         if not paths:
-            what = (
+            problem = (
                 "a folder without .asl logs"
                 if os.path.isdir(path)
                 else "no such file, folder or match"
             )
             raise InputError(
-                f"{item}: {what}",
+                f"{item}: {problem}",
                 "give rollout.asl files, folders that hold them, or a pattern in quotes",
             )
         for log in paths:
-            found.setdefault(real(log), log)
-    return list(found.values())
+            logs_by_path.setdefault(real(log), log)
+    return list(logs_by_path.values())
 
 
 def score_logs(
@@ -109,10 +109,10 @@ def score_logs(
     names: set[str] = set()
     for log in logs:
         began = time.perf_counter()
-        one = _score(log, scenes, preset, evaluators, root, taken, names)
-        one.manifest["wall_s"] = round(time.perf_counter() - began, 4)
-        scores.append(one)
-        on_done(one.manifest)
+        log_score = _score(log, scenes, preset, evaluators, root, taken, names)
+        log_score.manifest["wall_s"] = round(time.perf_counter() - began, 4)
+        scores.append(log_score)
+        on_done(log_score.manifest)
     return scores
 
 
@@ -141,23 +141,11 @@ def _score(
         rollout = read_asl(log)
     except InputError as error:
         return _failed(manifest, error, root, taken)
-    session = (
-        rollout.session_uuid or name
-    )  # as in AlpaSim; a second log with that id gets its folder's name with it
+    # as in AlpaSim; a second log with that id gets its folder's name with it
+    session = rollout.session_uuid or name
     session = session if session not in names else f"{session} ({name})"
     names.add(session)
-    versions = rollout.info["versions"]
-    manifest |= {
-        "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
-        "policy": _named(versions.get("egodriver")),
-        "scene": rollout.scene_id,
-        "seed": int(rollout.seed) & (2**63 - 1),
-        "rollout": session,
-        "session_uuid": rollout.session_uuid,
-        "frames": len(rollout.images),
-        "steps": _steps(rollout),
-        "warnings": list(rollout.warnings),
-    }
+    manifest |= _log_facts(rollout, session)
     # A wrong --scene is an error of the command, not of the log.
     scene = scenes.of(rollout.scene_id, log).scene
     cameras = {image.camera for image in rollout.images}
@@ -180,6 +168,27 @@ def _score(
     return LogScore(
         manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name)
     )
+
+
+def _log_facts(rollout: RolloutLog, session: str) -> JsonObject:
+    """Return the members of a manifest that the log itself states.
+
+    Args:
+        rollout: The log.
+        session: Name of the rollout.
+    """
+    versions = rollout.info["versions"]
+    return {
+        "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
+        "policy": _named(versions.get("egodriver")),
+        "scene": rollout.scene_id,
+        "seed": int(rollout.seed) & (2**63 - 1),
+        "rollout": session,
+        "session_uuid": rollout.session_uuid,
+        "frames": len(rollout.images),
+        "steps": _steps(rollout),
+        "warnings": list(rollout.warnings),
+    }
 
 
 Values = tuple[tuple[MetricSeries, ...], list[JsonObject], JsonObject]
@@ -312,7 +321,9 @@ def exit_code(
     scored, 4 for a rollout cut short.
     """
     classes = {
-        one.manifest["error"]["failure_class"] for one in scores if one.manifest["status"] != "ok"
+        log_score.manifest["error"]["failure_class"]
+        for log_score in scores
+        if log_score.manifest["status"] != "ok"
     }
     if "input" in classes:
         return 2
@@ -356,18 +367,18 @@ class KnownScenes:
         ref = self._ref(scene_id, None if stated is None else ref_of(stated["ref"]))
         if ref not in self._read:
             self._read[ref] = _read_scene(ref, is_ours=stated is not None)
-        found = self._read[ref]
-        if stated is not None and found.content_hash != stated["content_hash"]:
+        scene = self._read[ref]
+        if stated is not None and scene.content_hash != stated["content_hash"]:
             raise InputError(
                 f"scene {scene_id!r}: {ref.path} is not what was driven: its content has changed",
                 "give the scenario as it was driven, or run again",
             )
-        if self._used.setdefault(scene_id, found).content_hash != found.content_hash:
+        if self._used.setdefault(scene_id, scene).content_hash != scene.content_hash:
             raise InputError(
                 f"scene {scene_id!r}: the logs were driven in two scenes with this id",
                 "score the runs one by one",
             )
-        return found
+        return scene
 
     def _ref(self, scene_id: str, driven: ScenarioRef | None) -> ScenarioRef:
         """Return how to load the scene with an id, of what is given; of a run as it was driven.
@@ -376,22 +387,24 @@ class KnownScenes:
             InputError: None of the places has it.
         """
         seeded = SEEDED.fullmatch(scene_id)
-        given = self._refs.get(scene_id)
-        if given is None and driven is not None:
+        scene_ref = self._refs.get(scene_id)
+        if scene_ref is None and driven is not None:
             paths = {real(ref.path): ref for ref in self._refs.values()}
-            given = paths.get(real(driven.path))
-        if given is None and seeded and seeded["own"] in self._refs:
-            given = replace(self._refs[seeded["own"]], seed=int(seeded["seed"]))
-        if given is None:
-            known = sorted(self._refs)
+            scene_ref = paths.get(real(driven.path))
+        if scene_ref is None and seeded and seeded["own"] in self._refs:
+            scene_ref = replace(self._refs[seeded["own"]], seed=int(seeded["seed"]))
+        if scene_ref is None:
+            scene_ids = sorted(self._refs)
             raise InputError(
-                f"scene {scene_id!r}: not among the {len(known)} scenes of {', '.join(self.places)}: {some_of(known)}",
+                f"scene {scene_id!r}: not among the {len(scene_ids)} scenes of {', '.join(self.places)}: {some_of(scene_ids)}",
                 "name the log's scene with --scene, or a folder that holds it",
             )
         if driven is None:
-            return given
+            return scene_ref
         require_installed([driven.source], f"scene {scene_id!r}")
-        return replace(given, seed=driven.seed, overrides=driven.overrides, source=driven.source)
+        return replace(
+            scene_ref, seed=driven.seed, overrides=driven.overrides, source=driven.source
+        )
 
 
 def _stated_scene(log: Path, scene_id: str) -> JsonView | None:
@@ -430,13 +443,13 @@ def refs_by_id(places: Sequence[str]) -> dict[str, ScenarioRef]:
     Raises:
         InputError: A scene cannot be read, or two have one id.
     """
-    found: dict[str, ScenarioRef] = {}
+    refs: dict[str, ScenarioRef] = {}
     for place in places:
         for ref in _refs_of(place):
             scene_id = (
                 usdz_scene_id(Path(ref.path)) if ref.path.endswith(".usdz") else scene_id_of(ref)
             )
-            before = found.setdefault(scene_id, ref)
+            before = refs.setdefault(scene_id, ref)
             if replace(before, path=str(real(before.path))) != replace(
                 ref, path=str(real(ref.path))
             ):
@@ -444,7 +457,7 @@ def refs_by_id(places: Sequence[str]) -> dict[str, ScenarioRef]:
                     f"{_named_ref(before)} and {_named_ref(ref)}: both have the scene id {scene_id!r}",
                     "give one of them another id, or name one alone",
                 )
-    return found
+    return refs
 
 
 def _named_ref(ref: ScenarioRef) -> str:
@@ -473,18 +486,18 @@ def scenario_finder(places: Sequence[str]) -> Callable[[str], Scenario]:
     if not places:
         blank = load_scenario("smoke/straight")
         return lambda scene_id: replace(blank, scene_id=scene_id, actors=())
-    found = {
+    scenarios = {
         scene_id: load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         for scene_id, ref in refs_by_id(places).items()
     }
 
     def find(scene_id: str) -> Scenario:
-        if scene_id not in found:
-            shown = some_of(sorted(found))
+        if scene_id not in scenarios:
+            choices = some_of(sorted(scenarios))
             raise InputError(
-                f"scene {scene_id!r}: not among the {len(found)} scenes given: {shown}",
+                f"scene {scene_id!r}: not among the {len(scenarios)} scenes given: {choices}",
                 "name it with --scenes",
             )
-        return found[scene_id]
+        return scenarios[scene_id]
 
     return find

@@ -69,14 +69,21 @@ def tabulate(
     chosen = find_preset(preset)
     contacts = contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
     # Reports draw the distance from the recorded path also of runs whose preset does not score it.
-    drawn = [] if any(one.name == "lateral_bias_m" for one in series) else [lateral_bias(rollout)]
+    lateral_series = (
+        []
+        if any(metric_series.name == "lateral_bias_m" for metric_series in series)
+        else [lateral_bias(rollout)]
+    )
     rows = []
-    for one in (*series, *drawn):
-        reason = one.reason
+    for metric_series in (*series, *lateral_series):
+        reason = metric_series.reason
         for t_us, value, valid in zip(
-            one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True
+            metric_series.t_us.tolist(),
+            metric_series.value.tolist(),
+            metric_series.valid.tolist(),
+            strict=True,
         ):
-            row = _row(t_us, one.name, None if np.isnan(value) else value)
+            row = _row(t_us, metric_series.name, None if np.isnan(value) else value)
             rows.append(row | {"valid": valid, "reason": "" if valid else reason})
     # Rows of the ego's state, for plots and stratified results.
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
@@ -126,10 +133,14 @@ def _placed(rollout: RolloutLog, reduction: Reduction) -> list[JsonObject]:
     """Return the events with the position of the ego's box centre."""
     placed = []
     for event in reduction.events:
-        at = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
+        position = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
         after_s = round((int(event["t_us"]) - rollout.render_start_us) * 1e-6, 3)
         placed.append(
             dict(event)
-            | {"t_s": after_s, "x_m": round(float(at[0]), 3), "y_m": round(float(at[1]), 3)}
+            | {
+                "t_s": after_s,
+                "x_m": round(float(position[0]), 3),
+                "y_m": round(float(position[1]), 3),
+            }
         )
     return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))

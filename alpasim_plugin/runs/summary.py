@@ -64,16 +64,16 @@ def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Tab
         manifests: One per rollout, in the order of the tables.
         rollouts: The content of ``rollouts.parquet``.
     """
-    known = MetricTable.of_run(info)
+    metric_table = MetricTable.of_run(info)
     reasons = _invalid_reasons(manifests)
     table = RolloutTable.of_table(
         rollouts, lambda renderer, metric: reasons.get((renderer, metric), "")
     )
-    means = numbers(table, info["config"].get("baseline"), info.get("bases") or {}, known)
+    means = numbers(table, info["config"].get("baseline"), info.get("bases") or {}, metric_table)
     of_policy = _of_policies(manifests)
     finished = {
-        policy: [manifest for manifest in own if manifest["status"] == "ok"]
-        for policy, own in of_policy.items()
+        policy: [manifest for manifest in policy_manifests if manifest["status"] == "ok"]
+        for policy, policy_manifests in of_policy.items()
     }
     pool = info.get("pool")
     return Summary(
@@ -84,10 +84,19 @@ def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Tab
         paired_policies=means.paired_policies,
         failures=failures_of(manifests),
         outcomes=outcome_table(rollouts_of_table(rollouts), times_of(manifests)),
-        censoring=by_policy({policy: censoring(own, known) for policy, own in of_policy.items()}),
+        censoring=by_policy(
+            {
+                policy: censoring(policy_manifests, metric_table)
+                for policy, policy_manifests in of_policy.items()
+            }
+        ),
         copies=sum("copied_from" in manifest for manifest in manifests),
-        fixers=by_policy({policy: fixers(own) for policy, own in finished.items()}),
-        speed=by_policy({policy: _speeds(own) for policy, own in finished.items()}),
+        fixers=by_policy(
+            {policy: fixers(policy_manifests) for policy, policy_manifests in finished.items()}
+        ),
+        speed=by_policy(
+            {policy: _speeds(policy_manifests) for policy, policy_manifests in finished.items()}
+        ),
         pool=None if pool is None else Pool(**pool),
         repeat=info.get("repeat"),
         exit_code=info.get("exit_code"),
@@ -124,10 +133,10 @@ def failures_of(manifests: Sequence[JsonObject]) -> Failures:
 
 
 def _of_policies(manifests: Sequence[JsonObject]) -> dict[str, list[JsonObject]]:
-    found: dict[str, list[JsonObject]] = {}
+    manifests_by_policy: dict[str, list[JsonObject]] = {}
     for manifest in manifests:
-        found.setdefault(manifest["policy"], []).append(manifest)
-    return found
+        manifests_by_policy.setdefault(manifest["policy"], []).append(manifest)
+    return manifests_by_policy
 
 
 def _speeds(manifests: Sequence[JsonObject]) -> dict[str, Speed]:
@@ -238,12 +247,12 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> Summary
     table = RolloutTable.of_files([table_path(run, ROLLOUTS) for run in runs])
     if baseline is not None:
         base_named(baseline, variants_in(table), "the runs together")
-    known = _joined(infos, table.metrics)
+    metric_table = _joined(infos, table.metrics)
     bases = {
         name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()
     }
     by_class = table.failures()
-    means = numbers(table, baseline or first["config"].get("baseline"), bases, known)
+    means = numbers(table, baseline or first["config"].get("baseline"), bases, metric_table)
     return Summary(
         preset=first["preset"],
         metrics=means.metrics,
@@ -262,10 +271,12 @@ def joined_metrics(runs: Sequence[Path]) -> MetricTable:
 
 def _joined(infos: Mapping[Path, JsonView], metrics: Sequence[str]) -> MetricTable:
     first, *others = infos.items()
-    known = MetricTable.of_run(first[1])
+    joined_table = MetricTable.of_run(first[1])
     for run, info in others:
-        known = known.joined(MetricTable.of_run(info), metrics, f"{first[0]} and {run}")
-    return known
+        joined_table = joined_table.joined(
+            MetricTable.of_run(info), metrics, f"{first[0]} and {run}"
+        )
+    return joined_table
 
 
 def _check_alike(infos: Mapping[Path, JsonView]) -> None:
@@ -274,7 +285,7 @@ def _check_alike(infos: Mapping[Path, JsonView]) -> None:
     Raises:
         InputError: Presets differ, or a scene's content does.
     """
-    seen: dict[str, tuple[str, Path]] = {}
+    content_by_scene: dict[str, tuple[str, Path]] = {}
     first, kind = next((run, info["preset"]) for run, info in infos.items())
     for run, info in infos.items():
         if info["preset"] != kind:
@@ -284,9 +295,9 @@ def _check_alike(infos: Mapping[Path, JsonView]) -> None:
             )
         for scene, facts in info["scenes"].items():
             content = str(facts.get("content_hash") or "")
-            other, where = seen.setdefault(scene, (content, run))
+            other, first_run = content_by_scene.setdefault(scene, (content, run))
             if other != content:
                 raise InputError(
-                    f"{where} and {run}: scene {scene} with another content",
+                    f"{first_run} and {run}: scene {scene} with another content",
                     "aggregate runs of the same scene files",
                 )

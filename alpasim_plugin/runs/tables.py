@@ -34,11 +34,11 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     info = read_run_json(root)
     run = inspect_run(root)
     damage = [*inspect_files(root), *run.damage]
-    tables = [one for one in damage if not one.cell and one.file in TABLES]
-    for one in damage:
-        is_made_again = one in tables or one.file in (FILES, *REPORTS, *GATE_FILES)
-        if not is_made_again and os.path.exists(root / one.path):
-            raise InputError(f"{root}: {one}", again(info))
+    tables = [fault for fault in damage if not fault.cell and fault.file in TABLES]
+    for fault in damage:
+        is_made_again = fault in tables or fault.file in (FILES, *REPORTS, *GATE_FILES)
+        if not is_made_again and os.path.exists(root / fault.path):
+            raise InputError(f"{root}: {fault}", again(info))
     if not tables:
         return
     if run.damage or run.tables_only:

@@ -218,7 +218,7 @@ class BoundarySearch:
                 self.unreachable[values] = InputError(message, error.hint)
         return values in self.scenes
 
-    def _asked(self, failed: Mapping[Point, bool]) -> list[Point]:
+    def _candidates(self, failed: Mapping[Point, bool]) -> list[Point]:
         """Return the points that a variant and seed drives next."""
         if self.is_area:
             from alpasim_plugin.runs.vary_study import next_points as next_area_points
@@ -234,9 +234,9 @@ class BoundarySearch:
         cells: list[Cell] = []
         for (variant, seed), failed in self.failed.items():
             points: list[Point] = []
-            while not points and (asked := self._asked(failed)):
-                points = [point for point in asked if self._is_reachable(self._values(point))]
-                self.skipped |= set(asked) - set(points)
+            while not points and (candidates := self._candidates(failed)):
+                points = [point for point in candidates if self._is_reachable(self._values(point))]
+                self.skipped |= set(candidates) - set(points)
             for point in points:
                 plan = self.scenes[self._values(point)]
                 self.points[plan.cells[0].scene] = point
@@ -250,9 +250,13 @@ class BoundarySearch:
 
     def plan_of(self, cells: Sequence[Cell]) -> RunPlan:
         """Return a plan of some rollouts with the keys of the whole run."""
-        known = {name: one for plan in self.scenes.values() for name, one in plan.scenarios.items()}
+        scenario_by_name = {
+            name: scenario
+            for plan in self.scenes.values()
+            for name, scenario in plan.scenarios.items()
+        }
         wanted = dict.fromkeys(cell.scene for cell in cells)
-        scenarios = {name: known[name] for name in wanted}
+        scenarios = {name: scenario_by_name[name] for name in wanted}
         return replace(self.plan, cells=tuple(cells), scenarios=scenarios, whole=self.plan)
 
     def driven_plan(self) -> RunPlan:
@@ -260,7 +264,7 @@ class BoundarySearch:
         return self.plan_of(self.cells)
 
     def announce(self, root: Path, progress: Progress) -> None:
-        """Say nothing: the record is part of the summary."""
+        """Do nothing: `facts` puts the record into the summary."""
 
     def facts(self) -> JsonObject:
         """Return the record."""
@@ -277,10 +281,10 @@ class BoundarySearch:
                 metrics = manifest["metrics"]
                 measured = [metrics[name] for name in OUTCOMES if name in metrics]
                 failed = any(one["valid"] and one["value"] >= 0.5 for one in measured)
-                known = [
+                validities = [
                     metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")
                 ]
-                if not failed and not all(known):
+                if not failed and not all(validities):
                     failed = None  # it is not known
             if failed is None:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"
@@ -290,21 +294,21 @@ class BoundarySearch:
 
     def record(self) -> JsonObject:
         """Return what ``summary.json`` holds of the search, as its member ``boundary``."""
-        found = {one: self._of_variant(one) for one in self.variants}
+        facts_by_variant = {one: self._of_variant(one) for one in self.variants}
         base = usual_base(self.variants, self.plan.options.baseline)
         differences = {}
         for variant, other in base.pairs(self.variants):
-            brackets = found[variant][1]
-            others = found[other][1]
+            brackets = facts_by_variant[variant][1]
+            others = facts_by_variant[other][1]
             if brackets and others:
                 estimate = difference_of(brackets, others)
                 differences[variant.name] = {"baseline": other.name} | vars(estimate)
         grid_points = math.prod(one.steps + 1 for one in self.sweeps)
         record: JsonObject = {
-            "parameter": self._shown([one.key for one in self.sweeps]),
-            "unit": self._shown([one.unit for one in self.sweeps]),
-            "range": self._shown([[one.low, one.high] for one in self.sweeps]),
-            "reachable": self._shown([[one.low, one.high] for one in self.reached]),
+            "parameter": self._per_parameter([one.key for one in self.sweeps]),
+            "unit": self._per_parameter([one.unit for one in self.sweeps]),
+            "range": self._per_parameter([[one.low, one.high] for one in self.sweeps]),
+            "reachable": self._per_parameter([[one.low, one.high] for one in self.reached]),
             "unreachable": {
                 ", ".join(f"{one:g}" for one in values): error.message
                 for values, error in self.unreachable.items()
@@ -312,13 +316,13 @@ class BoundarySearch:
             "stopped": self.stopped,
             "rollouts": len(self.driven),
             "grid_rollouts": grid_points * len(self.failed),
-            "variants": {one.name: facts for one, (facts, _) in found.items()},
+            "variants": {one.name: facts for one, (facts, _) in facts_by_variant.items()},
             "differences": differences,
         }
         return record | {"sentence": sentence_of(record)}
 
-    def _shown(self, items: Sequence[Any]) -> Any:
-        """Return facts of both parameters, or the one of a single one."""
+    def _per_parameter(self, items: Sequence[Any]) -> Any:
+        """Return the facts of two parameters as a list, or the fact of a single parameter."""
         return list(items) if self.is_area else items[0]
 
     def _of_variant(self, variant: Variant) -> tuple[JsonObject, Sequence[Interval]]:

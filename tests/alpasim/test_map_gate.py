@@ -80,8 +80,8 @@ def test_the_right_map_stays_on(dashed, contrast):
 @pytest.mark.parametrize("aside_m", [1.75, -1.75, 0.9, -2.2])
 def test_a_map_that_is_aside_is_off_and_the_answer_says_where_the_paint_is(aside_m):
     found = judged(photograph(), prepared(aside_m))
-    assert found.here < DOUBT
-    assert found.there >= FITS
+    assert found.unmoved < DOUBT
+    assert found.best >= FITS
     assert found.offset_m == pytest.approx(-aside_m, abs=0.01)
 
 

@@ -227,7 +227,7 @@ def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root):
 
 def test_a_run_folder_is_named_by_what_was_driven_and_a_short_key(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    plan = replace(plan_of(), asked=("suites/first",))
+    plan = replace(plan_of(), scenario_names=("suites/first",))
     folder = default_folder(plan)
     assert folder == Path(f"runs/first-{plan.command_key[:4]}")
     run(folder, plan)

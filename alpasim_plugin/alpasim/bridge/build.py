@@ -50,9 +50,8 @@ def stage(target: Path) -> None:
         for path in sorted(source.rglob("*")):
             if path.suffix in SUFFIXES and path.name != "compile.py":
                 copy(path, package / name / path.relative_to(source))
-    client = (
-        (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")
-    )  # there the messages lie two folders nearer
+    # there the messages lie two folders nearer
+    client = (HERE / "client.py").read_text().replace("from ...log.wire", "from .wire")
     (package / "client.py").write_text(client)
     (package / "__init__.py").write_text(INIT)
     (target / "pyproject.toml").write_text(PROJECT)

@@ -17,12 +17,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Print version, scenes and cameras; return 0, 2 on wrong usage, or 4 if the service cannot be
     asked.
     """
-    given = sys.argv[1:] if arguments is None else arguments
-    if len(given) not in (1, 2) or given[0].startswith("-"):
+    words = sys.argv[1:] if arguments is None else arguments
+    if len(words) not in (1, 2) or words[0].startswith("-"):
         print("usage: onefixer-bridge HOST:PORT [SCENE]", file=sys.stderr)
         return 2
     try:
-        with grpc.insecure_channel(given[0], list(OPTIONS)) as channel:
+        with grpc.insecure_channel(words[0], list(OPTIONS)) as channel:
             service = Stub(channel, "SensorsimService")
             empty = common_pb2.Empty()
             version = service.get_version(empty, timeout=WAIT_S, wait_for_ready=True)
@@ -34,16 +34,18 @@ def main(arguments: list[str] | None = None) -> int:
             print(
                 f"scenes  {len(scenes)}: {', '.join(scenes[:5])}{' ...' if len(scenes) > 5 else ''}"
             )
-            scene = given[1] if len(given) > 1 else scenes[0]
-            asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=scene)
-            cameras = service.get_available_cameras(asked, timeout=TIMEOUT_S).available_cameras
+            scene = words[1] if len(words) > 1 else scenes[0]
+            camera_request = sensorsim_pb2.AvailableCamerasRequest(scene_id=scene)
+            cameras = service.get_available_cameras(
+                camera_request, timeout=TIMEOUT_S
+            ).available_cameras
             for camera in cameras:
                 size = camera.intrinsics.resolution_w, camera.intrinsics.resolution_h
                 print(
                     f"camera  {camera.logical_id}: {size[0]} x {size[1]}, {camera.intrinsics.WhichOneof('camera_param')}"
                 )
     except grpc.RpcError as error:
-        print(f"error: {given[0]}: {error.code().name}: {error.details()}", file=sys.stderr)
+        print(f"error: {words[0]}: {error.code().name}: {error.details()}", file=sys.stderr)
         return 4
     return 0
 

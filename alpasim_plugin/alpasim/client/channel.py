@@ -30,7 +30,7 @@ class Address:
     options: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def parse(cls, scheme: str, text: str, known: tuple[str, ...]) -> Address:
+    def parse(cls, scheme: str, text: str, option_names: tuple[str, ...]) -> Address:
         """Read an address.
 
         Example:
@@ -42,21 +42,21 @@ class Address:
         """
         target, _, query = text.partition("?")
         host, _, port = target.rpartition(":")
-        options = options_of(query, known, f"{scheme}://{text}")
+        options = options_of(query, option_names, f"{scheme}://{text}")
         if not host or not port.isdigit():
             raise InputError(f"{scheme}://{text}: no HOST:PORT", f"write {scheme}://HOST:PORT")
         return cls(target, options)
 
 
-def encoding_of(address: str, given: str) -> ImageEncoding:
+def encoding_of(address: str, encoding: str) -> ImageEncoding:
     """Return the encoding that an address asks for.
 
     Raises:
         InputError: It is none that the wire has.
     """
-    if given not in get_args(ImageEncoding):
-        raise InputError(f"{address}: encoding {given!r}", "write encoding=jpeg or encoding=png")
-    return cast("ImageEncoding", given)
+    if encoding not in get_args(ImageEncoding):
+        raise InputError(f"{address}: encoding {encoding!r}", "write encoding=jpeg or encoding=png")
+    return cast("ImageEncoding", encoding)
 
 
 LOOPBACK = re.compile(r"(127\.[0-9.]+|localhost|\[::1\]):[0-9]+|unix:.*")
@@ -134,12 +134,14 @@ class Service:
         raise AssertionError("the last attempt returns or raises")
 
     def _failure(self, error: Any, method: str, at_us: int | None) -> SimrunError:
-        where = self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
-        found = f"{self.name}.{method} failed: {error.code().name}: {error.details() or ''}"
+        location = (
+            self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
+        )
+        problem = f"{self.name}.{method} failed: {error.code().name}: {error.details() or ''}"
         if not is_lost_connection(error) or issubclass(self._error, InfrastructureError):
-            return self._error(f"{where}: {found}", "see the service's own log")
+            return self._error(f"{location}: {problem}", "see the service's own log")
         return InfrastructureError(
-            f"{where}: {found}",
+            f"{location}: {problem}",
             "see the service's own log, and drive the rollout again with --resume",
         )
 

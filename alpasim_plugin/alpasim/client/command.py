@@ -82,8 +82,8 @@ class SocketFile:
 
     def is_open(self) -> bool:
         """Tell whether somebody accepts connections there."""
-        with socket.socket(socket.AF_UNIX) as one, suppress(OSError):
-            one.connect(str(self._path))
+        with socket.socket(socket.AF_UNIX) as connection, suppress(OSError):
+            connection.connect(str(self._path))
             return True
         return False
 
@@ -119,8 +119,8 @@ class LoopbackPort:
 
     def is_open(self) -> bool:
         """Tell whether somebody accepts connections there."""
-        with socket.socket() as one, suppress(OSError):
-            one.connect((LOOPBACK, self._port))
+        with socket.socket() as connection, suppress(OSError):
+            connection.connect((LOOPBACK, self._port))
             return True
         return False
 
@@ -156,13 +156,13 @@ class Command:
             InputError: No program, one that is not found, an open quote, or an unknown option.
         """
         whole = f"exec:{text}"
-        head, _, rest = text.partition(" ") if text.startswith("?") else ("", "", text)
+        head, _, command_line = text.partition(" ") if text.startswith("?") else ("", "", text)
         options = options_of(head[1:], (*OPTIONS, "ready_s"), whole)
         for key in ("ready_s", "timeout_s"):
             if not re.fullmatch(r"\d+(\.\d+)?", options.get(key, "1")):
                 raise InputError(f"{whole}: {key}={options[key]!r}", "write seconds as a number")
         try:
-            words = tuple(shlex.split(rest))
+            words = tuple(shlex.split(command_line))
         except ValueError as error:
             raise InputError(f"{whole}: {error}", "close the quotes") from error
         if not words:
@@ -286,9 +286,8 @@ class CommandPolicy(DriverPolicy):
     def _call(self, method: str, request: Any) -> Any:
         try:
             return super()._call(method, request)
-        except (
-            SimrunError
-        ) as error:  # a connection is lost, too, where the command has ended: that is its own fault
+        # a connection is lost, too, where the command has ended: that is its own fault
+        except SimrunError as error:
             self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
             if "DEADLINE_EXCEEDED" in error.message:  # it hangs: the next rollout gets a new one
                 self._served.stop()

@@ -48,9 +48,8 @@ from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
-_SESSIONS = (
-    itertools.count()
-)  # sessions of several rollouts of one scene and seed may be open at one driver
+# sessions of several rollouts of one scene and seed may be open at one driver
+_SESSIONS = itertools.count()
 
 
 class DriverPolicy(Policy):
@@ -225,15 +224,14 @@ class DriverPolicy(Policy):
             if len(sample) and int(sample.t_us[-1]) >= int(times[-1]):
                 samples.append(in_rig(sample, observation, times)[1])
             else:
-                self._facts["samples_cut"] += (
-                    1  # a sample that ends before the plan has no place at the plan's last times
-                )
+                # a sample that ends before the plan has no place at the plan's last times
+                self._facts["samples_cut"] += 1
         return Plan(now, times, rows[:, :2], rows[:, 2], tuple(samples))
 
-    def _read(self, message: common_pb2.Trajectory, what: str) -> Trajectory:
+    def _read(self, message: common_pb2.Trajectory, title: str) -> Trajectory:
         """Return what the driver sent; poses or times that are none are its failure."""
         try:
-            return read_trajectory(message, what)
+            return read_trajectory(message, title)
         except InputError as error:
             raise PolicyError(
                 f"{self.service.target}: {error.message}",
@@ -280,21 +278,26 @@ def cameras_of(
     Raises:
         InputError: The scenario lacks a camera that is named, or has none.
     """
-    own = {camera.name: camera for camera in scenario.cameras}
-    main = next((name for name in (FRONT_WIDE, "front") if name in own), next(iter(own), ""))
+    cameras_by_name = {camera.name: camera for camera in scenario.cameras}
+    main = next(
+        (name for name in (FRONT_WIDE, "front") if name in cameras_by_name),
+        next(iter(cameras_by_name), ""),
+    )
     pairs = (
         [(main_name or main, main)]
         if text is None
         else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
     )
-    missing = [b for _, b in pairs if b not in own]
+    missing = [b for _, b in pairs if b not in cameras_by_name]
     if missing or not pairs:
-        found = f"no camera {missing[0]!r} among {sorted(own)}" if missing else "no camera"
+        problem = (
+            f"no camera {missing[0]!r} among {sorted(cameras_by_name)}" if missing else "no camera"
+        )
         raise InputError(
-            f"scene {scenario.scene_id!r}: {found}",
+            f"scene {scenario.scene_id!r}: {problem}",
             "write ?cameras=THEIRS:OURS,...",
         )
-    return {a: own[b] for a, b in pairs}
+    return {a: cameras_by_name[b] for a, b in pairs}
 
 
 def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None) -> tuple[I64, F64]:

@@ -51,20 +51,20 @@ class NreRenderer(Renderer):
             }
         else:
             request = sensorsim_pb2.AvailableCamerasRequest(scene_id=self._scene)
-            known = {
+            service_cameras = {
                 camera.logical_id
                 for camera in self._service.call(
                     "get_available_cameras", request, READY_S
                 ).available_cameras
             }
-            own = {camera.name for camera in scenario.cameras}
+            scenario_cameras = {camera.name for camera in scenario.cameras}
             self._names = (
                 {}
-                if own <= known
+                if scenario_cameras <= service_cameras
                 else {
                     camera.name: theirs
                     for theirs, camera in cameras_of(scenario, None).items()
-                    if theirs in known
+                    if theirs in service_cameras
                 }
             )
 

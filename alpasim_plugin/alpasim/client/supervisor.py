@@ -26,9 +26,8 @@ def main(grace_s: float, command: list[str]) -> int:
     bell, ring = os.pipe()
     for end in (bell, ring):
         os.set_blocking(end, False)
-    signal.signal(
-        signal.SIGCHLD, lambda *_: None
-    )  # with a handler, the signal's number is written to the pipe below
+    # with a handler, the signal's number is written to the pipe below
+    signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.set_wakeup_fd(ring, warn_on_full_buffer=False)
     try:
@@ -54,9 +53,8 @@ def main(grace_s: float, command: list[str]) -> int:
 
 
 def _signal_group(group: int, number: int) -> None:
-    with suppress(
-        ProcessLookupError, PermissionError
-    ):  # macOS answers EPERM for a group of ended processes
+    # macOS answers EPERM for a group of ended processes
+    with suppress(ProcessLookupError, PermissionError):
         os.killpg(group, number)
 
 

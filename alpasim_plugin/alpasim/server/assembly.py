@@ -56,11 +56,11 @@ def version_of(
     part = spec.base if spec.fixer is None else spec.fixer
     name = "identity" if spec.fixer is None and upstream is not None else spec.name
     weights = digest(sorted(part.files.values()))
-    given = None if part.settings is None else part.settings.model_dump(mode="json")
+    part_settings = None if part.settings is None else part.settings.model_dump(mode="json")
     base = None if upstream is not None else spec.base.digest
-    everything = digest([__version__, name, part.digest, base, given, settings])
+    everything = digest([__version__, name, part.digest, base, part_settings, settings])
     short = f"weights={weights[:12]}" if part.files else "weights=none"
-    text = f"simrun-{__version__}+{name} {short} settings={digest([given, settings])[:12]} code={(part.digest or 'remote')[:12]}"
+    text = f"simrun-{__version__}+{name} {short} settings={digest([part_settings, settings])[:12]} code={(part.digest or 'remote')[:12]}"
     version = common_pb2.VersionId(version_id=text, git_hash=everything[:40])
     if upstream is None:
         version.grpc_api_version.CopyFrom(api_version())
@@ -95,14 +95,14 @@ class Upstream:
             InputError: Another option, or a file that cannot be read.
         """
         address, _, query = text.partition("?")
-        given = options_of(query, ("ca", "token_file", "image"), f"--upstream {text}")
-        image = given.get("image", "png")
+        options = options_of(query, ("ca", "token_file", "image"), f"--upstream {text}")
+        image = options.get("image", "png")
         if not address or image not in ("png", "as-asked"):
             raise InputError(
                 f"--upstream {text}: no address, or an image that is neither png nor as-asked",
                 "write HOST:PORT[?ca=FILE&token_file=FILE&image=png|as-asked]",
             )
-        ca, token = (Path(given[key]) if key in given else None for key in ("ca", "token_file"))
+        ca, token = (Path(options[key]) if key in options else None for key in ("ca", "token_file"))
         return cls(address, ca, read_token(token), image == "png")
 
     def channel(self) -> Any:
@@ -179,14 +179,12 @@ class Assembled:
         self.tree.expire()
 
 
-def assemble(settings: Settings) -> Assembled:
-    """Build the renderer service.
+def _check_options(settings: Settings, spec: RendererSpec) -> None:
+    """Refuse options that do not fit together.
 
     Raises:
-        InputError: Settings that do not fit together, an unknown renderer, or scenes that cannot be
-            found.
+        InputError: Neither scenes nor an upstream, or an option of the one with the other.
     """
-    spec = resolve_served(settings.renderer, settings.overrides)
     if settings.upstream is None and not settings.scenes:
         raise InputError(
             "the command: neither --scenes nor --upstream",
@@ -207,13 +205,24 @@ def assemble(settings: Settings) -> Assembled:
             "--render-width: the upstream chooses the size of its images",
             "use it without --upstream",
         )
+
+
+def assemble(settings: Settings) -> Assembled:
+    """Build the renderer service.
+
+    Raises:
+        InputError: Settings that do not fit together, an unknown renderer, or scenes that cannot be
+            found.
+    """
+    spec = resolve_served(settings.renderer, settings.overrides)
+    _check_options(settings, spec)
     busy = threading.Lock()
     fixers = None if spec.fixer is None else FixerCache(spec, settings.device)
     needs_map = fixers is not None and fixers.needs_map
-    own = spec if settings.upstream is None else None
+    scene_spec = spec if settings.upstream is None else None
     scenes = None
     if settings.scenes:
-        scenes = SceneCache(settings.scenes, own, needs_map, settings.device)
+        scenes = SceneCache(settings.scenes, scene_spec, needs_map, settings.device)
     channel = stub = None
     source: FrameSource
     if settings.upstream is None:

@@ -59,13 +59,13 @@ def resolve_served(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     if spec.fixer.name == "identity":
         return RendererSpec(spec.name, spec.base)
     settings: Any = spec.fixer.settings
-    found = (
+    problem = (
         f"{spec.fixer.name} works on blocks of frames, whose poses are not part of a render request"
     )
     if settings.loop_mode == "frame by frame":
-        found = f"{spec.fixer.name} has one history a camera, and requests of several drives come over one connection"
+        problem = f"{spec.fixer.name} has one history a camera, and requests of several drives come over one connection"
     raise InputError(
-        f"renderer {name!r}: {found}",
+        f"renderer {name!r}: {problem}",
         "serve a fixer with an explicit past, such as onefixer",
     )
 
@@ -189,18 +189,18 @@ class SceneCache:
             InputError: It cannot be read or built.
             Late: The call's time is over.
         """
-        found = self._found(scene_id)
-        if found is not None:
-            return found
+        entry = self._found(scene_id)
+        if entry is not None:
+            return entry
         with left.holding(self._loading):
-            found = self._found(scene_id)  # another call may have loaded it meanwhile
-            if found is None:
-                found = self._load(self._sources[scene_id])
+            entry = self._found(scene_id)  # another call may have loaded it meanwhile
+            if entry is None:
+                entry = self._load(self._sources[scene_id])
                 with self._lock:
-                    self._loaded[scene_id] = found
+                    self._loaded[scene_id] = entry
                     while len(self._loaded) > KEPT_SCENES:
                         self._loaded.popitem(last=False)
-            return found
+            return entry
 
     def _found(self, scene_id: str) -> SceneEntry | None:
         """Return a scene if it is loaded, which is used by that."""
@@ -209,9 +209,9 @@ class SceneCache:
                 self._loaded.move_to_end(scene_id)
                 return self._loaded[scene_id]
         if scene_id not in self._sources:
-            some = some_of(self.ids)
+            examples = some_of(self.ids)
             raise UnknownScene(
-                f"scene {scene_id!r}: it is none of the {len(self._sources)} known: {some}",
+                f"scene {scene_id!r}: it is none of the {len(self._sources)} known: {examples}",
                 "add its file to --scenes",
             )
         return None
@@ -220,9 +220,11 @@ class SceneCache:
         scenario = load_scenario(source)
         renderer, references, reads_device = None, None, False
         if self._spec is not None:
-            drawn = LensCover(scenario.cameras).drawn(scenario)
-            built = complete(build(self._spec.base, scenario=drawn, **self._session), Renderer)
-            renderer = in_weather(built, drawn, self._session["seed"])
+            pinhole_scenario = LensCover(scenario.cameras).drawn(scenario)
+            built = complete(
+                build(self._spec.base, scenario=pinhole_scenario, **self._session), Renderer
+            )
+            renderer = in_weather(built, pinhole_scenario, self._session["seed"])
             settings = self._spec.fixer and self._spec.fixer.settings
             reads_device = isinstance(settings, PixelFixerSettings)
             if isinstance(settings, FixerSettings):

@@ -212,10 +212,10 @@ class Driving:
                 "send only the cameras of the session",
             )
         check_time(image.frame_end_us, "submit_image_observation")
-        where = f"camera {image.logical_id!r} at {image.frame_end_us} us"
-        size = check_image(image.image_bytes, where)
+        location = f"camera {image.logical_id!r} at {image.frame_end_us} us"
+        size = check_image(image.image_bytes, location)
         if fault := image_fault(image.image_bytes):
-            raise InputError(f"{where}: {fault}", "give a whole PNG or JPEG image")
+            raise InputError(f"{location}: {fault}", "give a whole PNG or JPEG image")
         with self._lock:
             if (held := self._sizes.setdefault(image.logical_id, size)) != size:
                 raise InputError(
@@ -253,16 +253,16 @@ class Driving:
     def take_motion(self, message: egodriver_pb2.RolloutEgoTrajectory) -> None:
         """Append poses; those at or before the newest one are left out."""
         with self._lock:
-            known = self._history
-            newest = int(known.t_us[-1]) if len(known) else -1
+            history = self._history
+            newest = int(history.t_us[-1]) if len(history) else -1
             new = [pose for pose in message.trajectory.poses if pose.timestamp_us > newest]
             t_us = increasing_times([pose.timestamp_us for pose in new], "the ego's motion")
             if new:
                 check_time(new[-1].timestamp_us, "submit_egomotion_observation")
                 xyz, quat = read_poses((pose.pose for pose in new), "the ego's motion")
-                times = np.concatenate((known.t_us, t_us))[-MOST_POSES:]
-                places = np.concatenate((known.xyz, xyz))[-MOST_POSES:]
-                turns = np.concatenate((known.quat, quat))[-MOST_POSES:]
+                times = np.concatenate((history.t_us, t_us))[-MOST_POSES:]
+                places = np.concatenate((history.xyz, xyz))[-MOST_POSES:]
+                turns = np.concatenate((history.quat, quat))[-MOST_POSES:]
                 self._history = Trajectory(times, places, turns)
             if message.dynamic_states:
                 self._state = message.dynamic_states[-1]
@@ -290,10 +290,10 @@ class Driving:
             ego = self._ego()
             history = self._history
             policy = self._policy = self._policy or self._started(ego)
-            shown = {name: self._frame(name) for name in self._images if name in self._cameras}
+            frames = {name: self._frame(name) for name in self._images if name in self._cameras}
             observation = Observation(
                 now_us,
-                shown,
+                frames,
                 self._cameras,
                 replace(ego, t_us=now_us),
                 history,
@@ -328,20 +328,22 @@ class Driving:
             lens = self._lens(name)
             mounting = read_transform(camera.rig_to_camera, f"mounting of camera {name!r}")
             cameras.append(CameraSpec(name, *lens.size, lens.K, mounting))
-        known = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
+        waypoints_rig = self._route_rig[np.isfinite(self._route_rig).all(axis=1)]
         route = Route(
-            transform_points(ego.T_world_rig, known) if len(known) else ego.T_world_rig[None, :3, 3]
+            transform_points(ego.T_world_rig, waypoints_rig)
+            if len(waypoints_rig)
+            else ego.T_world_rig[None, :3, 3]
         )
         policy = self._make(replace(self._scenario, cameras=tuple(cameras), route=route))
-        found = sensors_problem(policy.sensors)
-        wanted = [] if found else [sensor.camera for sensor in policy.sensors]
+        problem = sensors_problem(policy.sensors)
+        wanted = [] if problem else [sensor.camera for sensor in policy.sensors]
         missing = sorted(set(wanted) - set(self._native))
-        if found or missing:
-            found = (
-                found or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
+        if problem or missing:
+            problem = (
+                problem or f"it asks for cameras {missing}; the session has {sorted(self._native)}"
             )
             raise PolicyError(
-                f"{type(policy).__name__}: {found}",
+                f"{type(policy).__name__}: {problem}",
                 "name the session's cameras as the policy does: ?cameras=NAME,...",
             )
         self._cameras = {camera.name: camera for camera in cameras if camera.name in wanted}
@@ -349,9 +351,9 @@ class Driving:
         return policy
 
     def _ego(self) -> EgoState:
-        known = self._history
+        history = self._history
         now = int(self._history.t_us[-1])
-        pose = se3(known.xyz[-1], known.quat[-1])
+        pose = se3(history.xyz[-1], history.quat[-1])
         stated = 0.0
         turn = 0.0
         accel = 0.0
@@ -359,13 +361,15 @@ class Driving:
             stated = self._state.linear_velocity.x
             turn = self._state.angular_velocity.z
             accel = self._state.linear_acceleration.x
-        earlier = max(int(np.searchsorted(known.t_us, now - SPEED_WINDOW_US, side="right")) - 1, 0)
-        dt_s = (now - int(known.t_us[earlier])) * 1e-6
+        earlier = max(
+            int(np.searchsorted(history.t_us, now - SPEED_WINDOW_US, side="right")) - 1, 0
+        )
+        dt_s = (now - int(history.t_us[earlier])) * 1e-6
         if stated == 0.0 and dt_s > 0:
-            before = se3(known.xyz[earlier], known.quat[earlier])
-            seen = float((known.xyz[-1] - before[:3, 3]) @ pose[:3, 0]) / dt_s
-            if abs(seen) > MOVING_MPS:
-                stated = seen
+            before = se3(history.xyz[earlier], history.quat[earlier])
+            measured_mps = float((history.xyz[-1] - before[:3, 3]) @ pose[:3, 0]) / dt_s
+            if abs(measured_mps) > MOVING_MPS:
+                stated = measured_mps
                 turn = float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
         return EgoState(now, pose, float(stated), float(accel), float(turn))
 
@@ -442,7 +446,7 @@ def serve_policy(factory: Callable[..., Any], address: str | None = None) -> Non
         )
 
     service = _Serving(name, None, make, _unknown_scene)
-    with Host({"EgodriverService": service}, place, every=service.sessions.expire) as host:
+    with Host({"EgodriverService": service}, place, on_interval=service.sessions.expire) as host:
         host.wait()
 
 

@@ -94,16 +94,20 @@ class FrameServer:
         nodes: dict[bytes, Node[Answered]] = {}
         missing: dict[bytes, tuple[Request, View]] = {}
         for request, view in zip(requests, views, strict=True):
-            known = self.tree.find(view)
-            if known is None:
+            node = self.tree.find(view)
+            if node is None:
                 missing[view.key] = request, view
             else:
-                nodes[view.key] = known
+                nodes[view.key] = node
         if missing:
             # A camera's frames follow one another by time, however a call lists them.
-            by_time = sorted(missing.values(), key=lambda one: one[1].t_us)
-            asked, seen = zip(*by_time, strict=True)
-            for item, view in zip(self.source.render(asked, seen, left), seen, strict=True):
+            by_time = sorted(missing.values(), key=lambda pair: pair[1].t_us)
+            requests_in_time, views_in_time = zip(*by_time, strict=True)
+            for item, view in zip(
+                self.source.render(requests_in_time, views_in_time, left),
+                views_in_time,
+                strict=True,
+            ):
                 nodes[view.key] = self._fixed(item, view, left)
         images = [nodes[view.key].state.image for view in views]
         return [
@@ -115,9 +119,9 @@ class FrameServer:
         assert self._fixers is not None
         with left.holding(self._busy):
             # Under the lock: which frames there are does not change until the entry.
-            known = self.tree.find(view)
-            if known is not None:  # another call has made it meanwhile
-                return known
+            node = self.tree.find(view)
+            if node is not None:  # another call has made it meanwhile
+                return node
             parent = self.tree.parent_of(view)
             if parent is not None and parent.state.image.shape[:2] != item.frame.size:
                 raise UpstreamFault(

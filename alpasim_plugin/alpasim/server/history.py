@@ -35,12 +35,10 @@ from alpasim_plugin.core.geometry import rigid
 from alpasim_plugin.core.types import F64
 
 SLACK_M = 0.1  # error of a predicted pose that is always allowed ...
-ACCEL_MPS2 = (
-    10.0  # ... plus this times dt^2: twice the error of a constant speed under hard braking
-)
-SPEED_MPS = (
-    70.0  # where there is no motion to continue, farther than this times dt is another place
-)
+# ... plus this times dt^2: twice the error of a constant speed under hard braking
+ACCEL_MPS2 = 10.0
+# where there is no motion to continue, farther than this times dt is another place
+SPEED_MPS = 70.0
 LEVER_M = 2.0  # a turn by one radian counts as this distance
 S = TypeVar("S")
 GAP_US = 2_000_000  # longest time between two frames of a drive
@@ -59,14 +57,16 @@ def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tupl
     shutter_us = view.t_us - view.start_us
     reach_m = SLACK_M + ACCEL_MPS2 * (dt_us / 1e6) ** 2
     start, end = view.T_world_camera
-    here = before.T_world_camera[1]
+    position = before.T_world_camera[1]
     if shutter_us > 0:
         back = dt_us / shutter_us
-        return apart(on_line(end, start, back), here) + _objects_apart(view, before, back), reach_m
+        return apart(on_line(end, start, back), position) + _objects_apart(
+            view, before, back
+        ), reach_m
     if T_before is not None:
         last, last_us = T_before
-        return apart(end, on_line(last, here, 1 + dt_us / (before.t_us - last_us))), reach_m
-    return apart(end, here), SLACK_M + SPEED_MPS * dt_us / 1e6
+        return apart(end, on_line(last, position, 1 + dt_us / (before.t_us - last_us))), reach_m
+    return apart(end, position), SLACK_M + SPEED_MPS * dt_us / 1e6
 
 
 def on_line(a: F64, b: F64, s: float) -> F64:
@@ -148,9 +148,8 @@ class HistoryTree(Generic[S]):
         self.bytes = 0
         self.counts = Counts()
         self._nodes: OrderedDict[bytes, Node[S]] = OrderedDict()  # the longest unused first
-        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(
-            list
-        )  # sorted by time
+        # sorted by time
+        self._times: dict[tuple[str, str, bytes], list[tuple[int, bytes]]] = defaultdict(list)
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -205,11 +204,11 @@ class HistoryTree(Generic[S]):
 
     def _nearest(self, view: View) -> Node[S] | None:
         best: tuple[float, Node[S]] | None = None
-        at: int | None = None
+        newest_us: int | None = None
         for node in self._earlier(view):
-            if at is not None and node.view.t_us != at and best is not None:
+            if newest_us is not None and node.view.t_us != newest_us and best is not None:
                 return best[1]  # the latest time with a frame within reach has it
-            at = node.view.t_us
+            newest_us = node.view.t_us
             error, limit = distance(view, node.view, node.T_before)
             if error <= limit and (best is None or error < best[0]):
                 best = error, node

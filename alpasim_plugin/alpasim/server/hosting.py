@@ -215,16 +215,19 @@ class Sessions(Generic[S]):
             if name not in self._open:
                 return
             self._open[name].held = held
-            oldest = sorted(self._open, key=lambda one: (one == name, self._open[one].used_s))
+            oldest = sorted(
+                self._open,
+                key=lambda session_id: (session_id == name, self._open[session_id].used_s),
+            )
             over = self.held - self._budget
             crowded = []
-            for one in oldest:
+            for session_id in oldest:
                 if over > 0:
-                    over -= self._open[one].held
-                    crowded.append(one)
+                    over -= self._open[session_id].held
+                    crowded.append(session_id)
             self.crowded_out.extend(crowded)
-        for one in crowded:
-            self.close(one)
+        for session_id in crowded:
+            self.close(session_id)
         self.get(name)
 
     @contextmanager
@@ -325,9 +328,9 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
             return True
-        given = dict(metadata or ()).get("authorization", "")
-        given = given.encode() if isinstance(given, str) else given
-        return hmac.compare_digest(given, self._wanted)
+        token = dict(metadata or ()).get("authorization", "")
+        token = token.encode() if isinstance(token, str) else token
+        return hmac.compare_digest(token, self._wanted)
 
     def _answer(self, call: Callable[[Any, Any], Any], messages: Any, context: Any) -> Any:
         left = CallTime(context)
@@ -381,7 +384,7 @@ class Host:
         listen: str,
         policy: HostPolicy = HostPolicy(),
         workers: int = 16,
-        every: Callable[[], None] = lambda: None,
+        on_interval: Callable[[], None] = lambda: None,
     ) -> None:
         self.health = Health(services)
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
@@ -423,7 +426,7 @@ class Host:
         self.address = listen if is_socket else f"{host}:{bound}"
         policy.warn(self.address)
         self._ended = threading.Event()
-        self._every = every
+        self._on_interval = on_interval
         self._upkeep = threading.Thread(target=self._repeat, daemon=True, name="serve-upkeep")
 
     def start(self) -> Host:
@@ -456,4 +459,4 @@ class Host:
     def _repeat(self) -> None:
         while not self._ended.wait(UPKEEP_S):
             self._gate.cancel_slow_senders()
-            self._every()
+            self._on_interval()

@@ -33,25 +33,25 @@ class LensCache:
         """Give the bytes of all values."""
         return sum(ENTRY_BYTES + size_of(value) for value in self._kept.values())
 
-    def get(self, spec: sensorsim_pb2.CameraSpec, what: object, make: Callable[[], T]) -> T:
+    def get(self, spec: sensorsim_pb2.CameraSpec, variant: object, make: Callable[[], T]) -> T:
         """Return a value of a lens, made if it is not kept.
 
         Args:
             spec: The lens, as a request names it.
-            what: Which value, and for what size.
+            variant: Which value, and for what size.
             make: Makes it.
         """
-        whole = spec.SerializeToString(deterministic=True) + repr(what).encode()
+        whole = spec.SerializeToString(deterministic=True) + repr(variant).encode()
         key = hashlib.blake2b(whole, digest_size=16).digest()
-        found: T | None = self._kept.get(key)
-        if found is None:
+        value: T | None = self._kept.get(key)
+        if value is None:
             with self._making:
-                found = self._kept.get(key)
-                if found is None:
-                    found = self._kept[key] = make()
+                value = self._kept.get(key)
+                if value is None:
+                    value = self._kept[key] = make()
                     while self.held > self._most_bytes and len(self._kept) > 1:
                         del self._kept[next(iter(self._kept))]
-        return found
+        return value
 
 
 def size_of(value: Any) -> int:

@@ -56,12 +56,12 @@ class Contradiction:
     """An image that shows a map's lines beside where the map has them.
 
     Attributes:
-        here, there: Agreement where the map has its lines, and at the place that fits best.
+        unmoved, best: Agreement where the map has its lines, and at the place that fits best.
         offset_m: How far that is to the left, metres.
     """
 
-    here: float
-    there: float
+    unmoved: float
+    best: float
     offset_m: float
 
 
@@ -89,9 +89,8 @@ def contradiction(
 
     def agreement_at(offset_m: float) -> float | None:
         T = T_world_camera.copy()
-        T[:3, 3] -= offset_m * leftwards(
-            T_world_camera
-        )  # who stands to the right sees the lines to the left
+        # who stands to the right sees the lines to the left
+        T[:3, 3] -= offset_m * leftwards(T_world_camera)
         return agreement(
             pieces_of(line_pixels(draw_map(scene_map, small, T)) & open_road),
             markings,
@@ -106,15 +105,15 @@ def decided(
     """Decide from the agreement of a map's lines, moved to the left by some metres, and where the
     camera stands.
     """
-    here = agreement_at(0.0)
-    if here is None or here >= DOUBT:
+    unmoved = agreement_at(0.0)
+    if unmoved is None or unmoved >= DOUBT:
         return None
     best, offset_m = max(
         (agreement_at(offset_m) or 0.0, offset_m)
         for offset_m in LATERAL_OFFSETS_M
         if abs(offset_m - camera_offset_m) > UNMOVED_M
     )
-    return Contradiction(here, best, offset_m) if best >= FITS else None
+    return Contradiction(unmoved, best, offset_m) if best >= FITS else None
 
 
 def shrunk(camera: CameraSpec) -> CameraSpec:
@@ -152,14 +151,14 @@ def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
     return left * (project(path, T_world_rig[:2, 3] + leftwards(T_world_camera)[:2])[1] - left)
 
 
-def line_pixels(drawn: U8) -> Bool:
+def line_pixels(image: U8) -> Bool:
     """Return the pixels ``(H, W)`` of a drawn map that are lane markings: white or yellow, however
     faded.
     """
-    red, green, blue = (drawn[..., c].astype(np.int16) for c in range(3))
+    red, green, blue = (image[..., c].astype(np.int16) for c in range(3))
     top = np.maximum(np.maximum(red, green), blue)
-    both = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
-    return both & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2))
+    is_bright = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
+    return is_bright & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2))
 
 
 def top_hat(rgb: U8) -> U8:
@@ -194,14 +193,16 @@ def agreement(pieces: Pieces, markings: U8) -> float | None:
         return None
     width = markings.shape[1]
     size = pieces.end - pieces.first
-    own = _brightest(markings, pieces.row, pieces.first, pieces.end)
+    line_peak = _brightest(markings, pieces.row, pieces.first, pieces.end)
     wins = compared = 0.0
     for times in NEIGHBOURS:
         first = pieces.first + times * size
         end = pieces.end + times * size
         inside = (first >= 0) & (end <= width)
         beside = _brightest(markings, pieces.row[inside], first[inside], end[inside])
-        wins += float(np.sum(own[inside] > beside) + 0.5 * np.sum(own[inside] == beside))
+        wins += float(
+            np.sum(line_peak[inside] > beside) + 0.5 * np.sum(line_peak[inside] == beside)
+        )
         compared += float(inside.sum())
     return wins / compared if compared else None
 

@@ -210,9 +210,9 @@ class Sensorsim(Failures):
         theirs = self.forward("get_available_scenes", request, context)
         if self._scenes is None or self.verbatim:
             return theirs
-        known = set(theirs.scene_ids)
+        upstream_ids = set(theirs.scene_ids)
         return common_pb2.AvailableScenesReturn(
-            scene_ids=[i for i in self._scenes.ids if i in known or "*" in known]
+            scene_ids=[i for i in self._scenes.ids if i in upstream_ids or "*" in upstream_ids]
         )
 
     @answering
@@ -299,8 +299,8 @@ class Lidar:
     def rays(self) -> F64:
         """Return directions ``(N, 3)``: x forwards, y left, z up."""
         up, left = (
-            np.deg2rad(one).ravel()
-            for one in np.meshgrid(self.rows_deg, self.azimuths_deg, indexing="ij")
+            np.deg2rad(angles_deg).ravel()
+            for angles_deg in np.meshgrid(self.rows_deg, self.azimuths_deg, indexing="ij")
         )
         return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
 
@@ -350,11 +350,10 @@ def points_of(
     points = []
     bright = []
     for index, (camera, depth, image) in enumerate(zip(cameras, depths, images, strict=True)):
-        mine = rays[nearest == index]
-        p = mine @ camera.T_rig_camera[:3, :3]
-        u, v = (
-            camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1)
-        )  # pixel centres lie at halves
+        camera_rays = rays[nearest == index]
+        p = camera_rays @ camera.T_rig_camera[:3, :3]
+        # pixel centres lie at halves
+        u, v = (camera.K[i, i] * p[:, i] / p[:, 2] + camera.K[i, 2] - 0.5 for i in (0, 1))
         column, row = (
             np.clip(np.floor(x).astype(np.int64), 0, n - 2)
             for x, n in ((u, camera.width), (v, camera.height))
@@ -373,7 +372,7 @@ def points_of(
         z = 1.0 / np.where(smooth, (weights * around).sum(axis=0), single)
         length = z / p[:, 2]
         hit = length <= SCAN_MOST_M  # not where it is NaN, without a surface
-        points.append(mine[hit] * length[hit, None])
+        points.append(camera_rays[hit] * length[hit, None])
         bright.append(image[row + (b > 0.5), column + (a > 0.5)][hit].mean(axis=1) / 255.0)
     return np.concatenate(points), np.concatenate(bright)
 

@@ -38,8 +38,8 @@ def exposure_of(
     rolls = ROLLS.get(spec.shutter_type)
     if rolls is None or view.start_us == view.t_us:
         return None
-    what = ("shares", view.width, view.height, side.side, *rolls)
-    share = lenses.get(spec, what, lambda: _shares(spec, view, side, *rolls))
+    variant = ("shares", view.width, view.height, side.side, *rolls)
+    share = lenses.get(spec, variant, lambda: _shares(spec, view, side, *rolls))
     return Exposure(
         share,
         {name: view.objects[name][0] if name in view.objects else T for name, T in actors.items()},

@@ -44,10 +44,9 @@ from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.log.wire import sensorsim_pb2
 
-NEAR_M, FAR_M = (
-    0.25,
-    3.0,
-)  # distance from the recorded path where trust begins to fall, and where it has fallen
+# Distance from the recorded path where trust begins to fall, and where it has fallen.
+NEAR_M = 0.25
+FAR_M = 3.0
 FAR = 0.6  # above 0.5: a hole is never invented
 MAP_OFF = "map-off"
 log = logging.getLogger("simrun.serve")
@@ -116,18 +115,18 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     Raises:
         InputError: A track that the scene does not have.
     """
-    known = {actor.actor_id: actor for actor in entry.scenario.actors}
-    foreign = sorted(set(view.objects) - set(known))
+    actors_by_id = {actor.actor_id: actor for actor in entry.scenario.actors}
+    foreign = sorted(set(view.objects) - set(actors_by_id))
     if foreign:
-        found = f"track {foreign[0]!r}" + (
+        problem = f"track {foreign[0]!r}" + (
             f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         )
         raise InputError(
-            f"scene {view.scene_id!r}: {found}, not in the scene",
+            f"scene {view.scene_id!r}: {problem}, not in the scene",
             "render with the scene file that the runtime uses",
         )
     poses = {}
-    for actor_id, actor in known.items():
+    for actor_id, actor in actors_by_id.items():
         if (
             actor.is_static
             and actor_id not in view.objects
@@ -147,19 +146,19 @@ def asked_of(
         InputError: A track that the scene does not have.
     """
     actors = boxes_at(entry, view)
-    own = scene_camera(entry.scenario, view.camera)
-    name = own.name if own else view.camera
-    asked = []
+    stored_camera = scene_camera(entry.scenario, view.camera)
+    name = stored_camera.name if stored_camera else view.camera
+    requests = []
     for side in sides:
         camera = side.spec(name, T_rig_camera, view.t_us - view.start_us)
         T = view.T_world_camera @ side.T_lens_pinhole
         exposure = exposure_of(request.camera_intrinsics, view, side, actors)
-        asked.append(RenderRequest(view.t_us, camera, T, actors, exposure=exposure))
-    return asked
+        requests.append(RenderRequest(view.t_us, camera, T, actors, exposure=exposure))
+    return requests
 
 
 def drawn_map(
-    entry: SceneEntry, asked: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = "cpu"
+    entry: SceneEntry, requests: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = "cpu"
 ) -> Any:
     """Return the semantic map as the lens sees it, of the device that drew its frame; None where
     the fixer takes none.
@@ -168,14 +167,14 @@ def drawn_map(
     actors = entry.scenario.actors
     if scene_map is None:
         return None
-    return joined_image(sides, draw_exposed_maps(scene_map, asked, actors, device=device))
+    return joined_image(sides, draw_exposed_maps(scene_map, requests, actors, device=device))
 
 
 def gated(
     rendered: Rendered,
     entry: SceneEntry,
-    asked: RenderRequest,
-    shown: U8,
+    request: RenderRequest,
+    image: U8,
     view: View,
 ) -> Rendered:
     """Take the map away from a frame that contradicts it, with an event ``map-off`` and a line in
@@ -184,34 +183,34 @@ def gated(
     Args:
         rendered: With a map.
         entry: Its scene.
-        asked: The pinhole, poses and road users of ``shown``.
-        shown: The frame as that pinhole shows it.
+        request: The pinhole, poses and road users of ``image``.
+        image: The frame as that pinhole shows it.
         view: For the log.
     """
     assert entry.scene_map is not None, "a frame with a map is of a scene with one"
     T, actors = (
-        at_share(asked, 0.5)
-        if asked.exposure is not None
-        else (asked.T_world_camera[1], asked.actors)
+        at_share(request, 0.5)
+        if request.exposure is not None
+        else (request.T_world_camera[1], request.actors)
     )
-    beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(asked.camera.T_rig_camera), T)
-    found = contradiction(
+    beside_m = beside(entry.scenario.ego_log.xyz, T @ inverse(request.camera.T_rig_camera), T)
+    conflict = contradiction(
         entry.scene_map,
-        asked.camera,
+        request.camera,
         T,
         actor_boxes(actors, entry.scenario.actors),
-        shown,
+        image,
         beside_m,
     )
-    if found is None:
+    if conflict is None:
         return rendered
-    what = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
-    found_at = f"{abs(found.offset_m)} m {'left' if found.offset_m > 0 else 'right'} of where the map has it"
+    title = f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us"
+    found_at = f"{abs(conflict.offset_m)} m {'left' if conflict.offset_m > 0 else 'right'} of where the map has it"
     log.warning(
         "%s: the map is off: lane markings agree %.2f with the map and %.2f %s",
-        what,
-        found.here,
-        found.there,
+        title,
+        conflict.unmoved,
+        conflict.best,
         found_at,
     )
     frame = rendered.frame.changed(events=(*rendered.frame.events, MAP_OFF))
@@ -250,17 +249,17 @@ class LocalSource:
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
         sides = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
-        asked = asked_of(entry, request, view, mount_of(entry, view), sides)
+        requests = asked_of(entry, request, view, mount_of(entry, view), sides)
         with left.holding(self._busy):
-            frames = entry.render(asked, entry.reads_device)
+            frames = entry.render(requests, entry.reads_device)
             place = frames[0].device if entry.reads_device else "cpu"
-            sdmap = drawn_map(entry, asked, sides, place)
+            sdmap = drawn_map(entry, requests, sides, place)
         frame = joined(view.camera, sides, frames).changed(camera=view.camera)
         rendered = Rendered(frame, sdmap, blind_of(sides))
         if sdmap is None:
             return rendered
         ahead = max(range(len(sides)), key=lambda i: float(sides[i].T_lens_pinhole[2, 2]))
-        return gated(rendered, entry, asked[ahead], frames[ahead].rgb, view)
+        return gated(rendered, entry, requests[ahead], frames[ahead].rgb, view)
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.
@@ -276,12 +275,12 @@ class LocalSource:
         """
         entry = self._scenes.get(view.scene_id, left)
         boxes = boxes_at(entry, view)
-        asked = [
+        requests = [
             RenderRequest(view.t_us, camera, view.T_world_camera @ camera.T_rig_camera, boxes)
             for camera in cameras
         ]
         with left.holding(self._busy):
-            return entry.render(asked)
+            return entry.render(requests)
 
 
 class UpstreamSource:
@@ -332,10 +331,10 @@ class UpstreamSource:
     def _asked(self, request: Request) -> Request:
         if not self._as_png:
             return request
-        asked = Request()
-        asked.CopyFrom(request)  # fields of newer versions are kept
-        asked.image_format = sensorsim_pb2.PNG
-        return asked
+        upstream_request = Request()
+        upstream_request.CopyFrom(request)  # fields of newer versions are kept
+        upstream_request.image_format = sensorsim_pb2.PNG
+        return upstream_request
 
     def _images(
         self, requests: Sequence[Request], names: Sequence[str], left: CallTime
@@ -367,21 +366,21 @@ class UpstreamSource:
         rendered = Rendered(Frame(view.t_us, view.camera, rgb, alpha), None)
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
-            seen = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
-            sides = read_sides(seen.camera_intrinsics, width, height)
+            bare_request = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
+            sides = read_sides(bare_request.camera_intrinsics, width, height)
             sized = replace(view, width=width, height=height)
-            asked = asked_of(entry, seen, sized, np.eye(4), sides)
-            sdmap = drawn_map(entry, asked, sides)
+            requests = asked_of(entry, bare_request, sized, np.eye(4), sides)
+            sdmap = drawn_map(entry, requests, sides)
             if sdmap is not None:
-                straight = straight_of(seen.camera_intrinsics, width, height)
+                straight = straight_of(bare_request.camera_intrinsics, width, height)
                 mounted = straight.K, mount_of(entry, view)
                 camera = CameraSpec(view.camera, *straight.size, *mounted)
-                shown = straight.image(rgb)
+                straight_image = straight.image(rgb)
                 rendered = gated(
                     replace(rendered, sdmap=sdmap),
                     entry,
-                    replace(asked[0], camera=camera, T_world_camera=view.T_world_camera),
-                    shown,
+                    replace(requests[0], camera=camera, T_world_camera=view.T_world_camera),
+                    straight_image,
                     view,
                 )
         return rendered
@@ -396,9 +395,9 @@ class UpstreamSource:
             if self._scenes is not None:
                 path = self._scenes.get(view.scene_id, left).scenario.ego_log.xyz
             else:
-                asked = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
+                path_request = sensorsim_pb2.AvailableTrajectoriesRequest(scene_id=view.scene_id)
                 listed = self._stub.get_available_trajectories(
-                    asked, timeout=left.left_s()
+                    path_request, timeout=left.left_s()
                 ).available_trajectories
                 if not listed or len(listed[0].trajectory.poses) < 2:
                     raise InputError(
@@ -415,23 +414,22 @@ class UpstreamSource:
         key = view.scene_id, view.camera
         if key not in self._mounts:
             forget_if_many(self._mounts)
-            asked = sensorsim_pb2.AvailableCamerasRequest(scene_id=view.scene_id)
+            camera_request = sensorsim_pb2.AvailableCamerasRequest(scene_id=view.scene_id)
             for camera in self._stub.get_available_cameras(
-                asked, timeout=left.left_s()
+                camera_request, timeout=left.left_s()
             ).available_cameras:
                 self._mounts[view.scene_id, camera.logical_id] = read_transform(
                     camera.rig_to_camera, f"mount of {camera.logical_id!r}"
                 )
-            self._mounts.setdefault(
-                key, np.eye(4)
-            )  # a camera of the runtime's own: its place counts instead of the rig's
+            # a camera of the runtime's own: its place counts instead of the rig's
+            self._mounts.setdefault(key, np.eye(4))
         return self._mounts[key]
 
 
-def forget_if_many(known: dict[Any, Any]) -> None:
+def forget_if_many(values_by_name: dict[Any, Any]) -> None:
     """Empty what is remembered by names that come from requests, before it grows without end."""
-    if len(known) >= MOST_NAMES:
-        known.clear()
+    if len(values_by_name) >= MOST_NAMES:
+        values_by_name.clear()
 
 
 def mount_of(entry: SceneEntry, view: View) -> F64:
@@ -448,19 +446,19 @@ def batch_images(reply: sensorsim_pb2.BatchRGBRenderReturn, names: Sequence[str]
     Raises:
         UpstreamFault: An image is missing, there twice, or marked as failed.
     """
-    found = {item.camera_name: item for item in reply.items}
+    items_by_camera = {item.camera_name: item for item in reply.items}
     bad = [
         item.error_message or f"item {item.camera_name!r} has success = false"
         for item in reply.items
         if not item.success
     ]
-    if bad or len(reply.items) != len(names) or set(found) != set(names):
-        what = bad[0] if bad else f"{len(reply.items)} items for {len(names)}"
-        raise UpstreamFault(f"the upstream's batch: {what}", "see the upstream's log")
-    return [found[name].result.image_bytes for name in names]
+    if bad or len(reply.items) != len(names) or set(items_by_camera) != set(names):
+        problem = bad[0] if bad else f"{len(reply.items)} items for {len(names)}"
+        raise UpstreamFault(f"the upstream's batch: {problem}", "see the upstream's log")
+    return [items_by_camera[name].result.image_bytes for name in names]
 
 
-def decoded(data: bytes, what: str) -> U8:
+def decoded(data: bytes, title: str) -> U8:
     """Decode an upstream's image.
 
     Raises:
@@ -474,13 +472,13 @@ def decoded(data: bytes, what: str) -> U8:
     try:
         if not whole:
             raise InputError(
-                f"{what}: {len(data)} bytes that are no whole PNG or JPEG",
+                f"{title}: {len(data)} bytes that are no whole PNG or JPEG",
                 "see the upstream's log",
             )
-        return decode_image(data, what)
+        return decode_image(data, title)
     except SimrunError as error:
         raise UpstreamFault(
-            f"{what}: the upstream's image: {error.message}", "see the upstream's log"
+            f"{title}: the upstream's image: {error.message}", "see the upstream's log"
         ) from error
 
 

@@ -69,24 +69,24 @@ def read_view(request: sensorsim_pb2.RGBRenderRequest) -> View:
             that is not finite or whose quaternion is no unit quaternion, or a track twice.
     """
     camera = request.camera_intrinsics.logical_id
-    what = f"scene {request.scene_id!r}, camera {camera!r} at {request.frame_end_us} us"
+    title = f"scene {request.scene_id!r}, camera {camera!r} at {request.frame_end_us} us"
     sides = request.resolution_w, request.resolution_h
     if not (min(sides) > 0 and max(sides) <= MAX_SIDE_PX and sides[0] * sides[1] <= MAX_PIXELS):
         raise InputError(
-            f"{what}: {request.resolution_w} x {request.resolution_h} pixels",
+            f"{title}: {request.resolution_w} x {request.resolution_h} pixels",
             f"ask for 1 to {MAX_SIDE_PX} pixels a side, and {MAX_PIXELS} in all",
         )
     if not request.frame_start_us <= request.frame_end_us < MAX_TIME_US:
         raise InputError(
-            f"{what}: a shutter from {request.frame_start_us} to {request.frame_end_us} us",
+            f"{title}: a shutter from {request.frame_start_us} to {request.frame_end_us} us",
             "give microseconds that do not fall",
         )
     objects = {
-        o.track_id: read_pair(o.pose_pair, f"{what}, track {o.track_id!r}")
+        o.track_id: read_pair(o.pose_pair, f"{title}, track {o.track_id!r}")
         for o in request.dynamic_objects
     }
     if len(objects) != len(request.dynamic_objects):
-        raise InputError(f"{what}: a track id twice", "send every dynamic object once")
+        raise InputError(f"{title}: a track id twice", "send every dynamic object once")
     content = sensorsim_pb2.RGBRenderRequest()
     content.CopyFrom(request)
     content.ClearField("image_format")
@@ -99,19 +99,19 @@ def read_view(request: sensorsim_pb2.RGBRenderRequest) -> View:
         request.resolution_h,
         request.frame_start_us,
         request.frame_end_us,
-        read_pair(request.sensor_pose, what),
+        read_pair(request.sensor_pose, title),
         objects,
         _digest(request.camera_intrinsics.SerializeToString(deterministic=True) + size),
         _digest(content.SerializeToString(deterministic=True)),
     )
 
 
-def read_pair(pair: sensorsim_pb2.PosePair, what: str) -> F64:
+def read_pair(pair: sensorsim_pb2.PosePair, title: str) -> F64:
     """Return ``(2, 4, 4)`` of a pose pair; see `read_view`."""
-    return np.stack([read_pose(pose, what) for pose in (pair.start_pose, pair.end_pose)])
+    return np.stack([read_pose(pose, title) for pose in (pair.start_pose, pair.end_pose)])
 
 
-def read_pose(pose: common_pb2.Pose, what: str) -> F64:
+def read_pose(pose: common_pb2.Pose, title: str) -> F64:
     """Return the ``(4, 4)`` matrix of a pose; see `read_view`."""
     v = pose.vec
     q = pose.quat
@@ -120,7 +120,7 @@ def read_pose(pose: common_pb2.Pose, what: str) -> F64:
     square = float(quat @ quat)
     if not (np.isfinite(xyz).all() and abs(square - 1.0) <= QUAT_NORM_TOLERANCE):
         raise InputError(
-            f"{what}: position {xyz.tolist()}, quaternion {quat.tolist()} with |q|^2 = {square:.6g}",
+            f"{title}: position {xyz.tolist()}, quaternion {quat.tolist()} with |q|^2 = {square:.6g}",
             "give finite positions and unit quaternions (w = 1 where there is no rotation)",
         )
     return se3(xyz, quat / np.sqrt(square))
@@ -141,8 +141,8 @@ def read_sides(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> tuple
         InputError: No intrinsics, values that make no lens, a windshield model, or a view of more
             than 110 degrees from the axis.
     """
-    what = ("sides", width, height)
-    return lenses.get(spec, what, lambda: sides_of(camera_of(spec, width, height)))
+    variant = ("sides", width, height)
+    return lenses.get(spec, variant, lambda: sides_of(camera_of(spec, width, height)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,21 +160,23 @@ class Straight:
     size: tuple[int, int]
     place: F32 | None
 
-    def image(self, seen: U8) -> U8:
+    def image(self, lens_image: U8) -> U8:
         """Return the pinhole's image of the lens's ``(H, W, 3)``; black where the lens sees
         nothing.
         """
         if self.place is None:
-            return seen
-        return cv2.remap(seen, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            return lens_image
+        return cv2.remap(
+            lens_image, self.place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
 
 
 def straight_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
     """Return the pinhole for the images ``(height, width)`` of a lens, as far as one plane can carry
     what it sees; see `read_sides`.
     """
-    what = ("straight", width, height)
-    return lenses.get(spec, what, lambda: _straight(spec, width, height))
+    variant = ("straight", width, height)
+    return lenses.get(spec, variant, lambda: _straight(spec, width, height))
 
 
 def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straight:
@@ -188,29 +190,29 @@ def _straight(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Straig
     size = width, max(round(lens.cover[1] * width / lens.cover[0]), 1)
     K = np.diag([*(np.array(size) / lens.cover), 1.0]) @ lens.K
     pinhole = replace(lens, K=K, cover=size)
-    place, shown = place_in_lens(camera, pinhole)
-    place[~shown] = -1e6
+    place, is_visible = place_in_lens(camera, pinhole)
+    place[~is_visible] = -1e6
     return Straight(K, size, place)
 
 
 def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> CameraSpec:
     """Return a request's camera at the asked size; see `read_sides`."""
-    what = f"camera {spec.logical_id!r}"
+    title = f"camera {spec.logical_id!r}"
     if spec.resolution_w == 0 or spec.resolution_h == 0:
-        raise InputError(f"{what}: no calibrated resolution", "fill resolution_w and resolution_h")
+        raise InputError(f"{title}: no calibrated resolution", "fill resolution_w and resolution_h")
     if width * height > MAX_PIXELS:
         raise InputError(
-            f"{what}: {width} x {height} pixels", f"ask for at most {MAX_PIXELS} in all"
+            f"{title}: {width} x {height} pixels", f"ask for at most {MAX_PIXELS} in all"
         )
     if spec.WhichOneof("external_distortion") is not None:
         raise InputError(
-            f"{what}: a windshield model",
+            f"{title}: a windshield model",
             "it cannot be rendered here: put a renderer that can behind --upstream",
         )
     kind = spec.WhichOneof("camera_param")
     if kind is None or kind not in LENSES:
         raise InputError(
-            f"{what}: no intrinsics",
+            f"{title}: no intrinsics",
             "fill ftheta_param, opencv_pinhole_param or opencv_fisheye_param",
         )
     p = getattr(spec, kind)
@@ -224,28 +226,28 @@ def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Camera
             [0, 0, 1.0],
         ]
     )
-    lens = LENSES[kind](p, what)
+    lens = LENSES[kind](p, title)
     if not (lens or (np.isfinite(K).all() and min(focal) > 0)):
-        raise InputError(f"{what}: focal lengths {focal[0]:.4g}, {focal[1]:.4g}", DO_THIS)
+        raise InputError(f"{title}: focal lengths {focal[0]:.4g}, {focal[1]:.4g}", DO_THIS)
     size = spec.resolution_w, spec.resolution_h
     return resized(CameraSpec(spec.logical_id, *size, K, np.eye(4), lens=lens), width, height)
 
 
-def _opencv(p: Any, what: str) -> LensModel | None:
+def _opencv(p: Any, title: str) -> LensModel | None:
     lengths = (p.radial_coeffs, 6), (p.tangential_coeffs, 2), (p.thin_prism_coeffs, 4)
     if any(len(given) > n for given, n in lengths):
-        raise InputError(f"{what}: more coefficients than k1..k6, p1, p2, s1..s4", DO_THIS)
+        raise InputError(f"{title}: more coefficients than k1..k6, p1, p2, s1..s4", DO_THIS)
     k, t, s = ((*given, *[0.0] * (n - len(given))) for given, n in lengths)
     if not any((*k, *t, *s)):
         return None
     return LensModel("opencv", (*k[:2], *t, *k[2:], *s))
 
 
-def _fisheye(p: Any, what: str) -> LensModel:
+def _fisheye(p: Any, title: str) -> LensModel:
     return LensModel("fisheye", tuple(p.radial_coeffs), max_angle_rad=p.max_angle)
 
 
-def _ftheta(p: Any, what: str) -> LensModel:
+def _ftheta(p: Any, title: str) -> LensModel:
     forward = tuple(p.angle_to_pixeldist_poly)
     backward = tuple(p.pixeldist_to_angle_poly)
     linear = (1.0, 0.0, 0.0)

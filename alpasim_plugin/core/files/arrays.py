@@ -26,13 +26,13 @@ START_ANEW = "remove the folder and start again, or put a whole copy of the file
 Array = np.ndarray[Any, Any]
 
 
-def parse_npy(data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> Array:
+def parse_npy(data: bytes, location: Path | str, do_this: str = FETCH_AGAIN) -> Array:
     """Return the array of a ``.npy`` document.
 
     Raises:
         InputError: No NumPy array, one of objects, or less data than its header announces.
     """
-    with parsing(where, do_this, NO_ARRAY):
+    with parsing(location, do_this, NO_ARRAY):
         return npy_format.read_array(io.BytesIO(data), allow_pickle=False)
 
 

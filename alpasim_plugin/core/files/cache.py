@@ -27,7 +27,7 @@ def cached(
     key: str,
     make: Callable[[Path], None],
     read: Callable[[Path], T],
-    what: str,
+    title: str,
 ) -> T:
     """Return what ``read`` finds under a key, made first if it is not there.
 
@@ -39,7 +39,7 @@ def cached(
         key: Name by content.
         make: Fills an empty folder.
         read: Reads a filled one.
-        what: What is made, for the lines on standard error.
+        title: What is made, for the lines on standard error.
 
     Raises:
         InfrastructureError: The cache cannot be written.
@@ -50,9 +50,9 @@ def cached(
         try:
             return read(folder)
         except InputError as error:
-            warn(f"warning: {what} is damaged ({error.message}); making it again")
+            warn(f"warning: {title} is damaged ({error.message}); making it again")
     with one_writer(
-        folder.with_name(f"{key}.lock"), what, wait=True, waiting=warn, do_this=DO_THIS
+        folder.with_name(f"{key}.lock"), title, wait=True, waiting=warn, do_this=DO_THIS
     ):
         # of a process that was killed while it made this entry
         for left_over in folder.parent.glob(f".{key}.*.tmp"):
@@ -62,9 +62,9 @@ def cached(
                 return read(folder)
             except InputError:
                 pass  # damaged, and said above
-        warn(f"{what} ...")
+        warn(f"{title} ...")
         began = time.perf_counter()
         with atomic_folder(folder) as partial:
             make(partial)
-        warn(f"{what}: {time.perf_counter() - began:.1f} s")
+        warn(f"{title}: {time.perf_counter() - began:.1f} s")
         return read(folder)

@@ -275,21 +275,21 @@ def apply_overrides(
     data = copy.deepcopy(document.data)
     marks = dict(document.marks)
     for text in overrides:
-        where = f"{origin} {text}"
+        location = f"{origin} {text}"
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             raise InputError(
-                f"{where}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
+                f"{location}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
             )
-        loc = _assign(data, key.strip().split("."), value_of(value, where), where)
+        loc = _assign(data, key.strip().split("."), value_of(value, location), location)
         marks = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
         for n in range(1, len(loc)):
-            marks.setdefault(loc[:n], Mark(where, 0, 0))
-        marks[loc] = Mark(where, 0, 0)
+            marks.setdefault(loc[:n], Mark(location, 0, 0))
+        marks[loc] = Mark(location, 0, 0)
     return Document(data, marks, document.path)
 
 
-def value_of(text: str, where: str) -> Any:
+def value_of(text: str, location: str) -> Any:
     """Return the plain data of a value on the command line: YAML, in which ``#`` begins no comment.
 
     Raises:
@@ -297,7 +297,7 @@ def value_of(text: str, where: str) -> Any:
     """
     if re.search(r"(^|\s)#", text) and not re.search(r"[\"'\[\]{}\n]", text):
         return text.strip()
-    return parse(text, where).data
+    return parse(text, location).data
 
 
 def override_locations(document: Document, overrides: Sequence[str]) -> list[tuple[Key, Any]]:
@@ -308,16 +308,16 @@ def override_locations(document: Document, overrides: Sequence[str]) -> list[tup
         InputError: As `apply_overrides`.
     """
     data = copy.deepcopy(document.data)
-    found = []
+    assignments = []
     for text in overrides:
-        where = f"--set {text}"
+        location = f"--set {text}"
         key, _, value = text.partition("=")
-        plain = value_of(value, where)
-        found.append((_assign(data, key.strip().split("."), plain, where), plain))
-    return found
+        plain = value_of(value, location)
+        assignments.append((_assign(data, key.strip().split("."), plain, location), plain))
+    return assignments
 
 
-def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:
+def _assign(data: Any, keys: list[str], value: Any, location: str) -> Key:
     """Set a dotted key in place; return its path."""
     loc: Key = ()
     node = data
@@ -330,10 +330,12 @@ def _assign(data: Any, keys: list[str], value: Any, where: str) -> Key:
             elif key.isdecimal() and int(key) < len(node):
                 step = int(key)
             else:
-                known = ", ".join(str(name) for name in ids if name) or f"0..{len(node) - 1}"
-                raise InputError(f"{where}: no list item {key!r}", f"use one of: {known}")
+                choices = ", ".join(str(name) for name in ids if name) or f"0..{len(node) - 1}"
+                raise InputError(f"{location}: no list item {key!r}", f"use one of: {choices}")
         elif not isinstance(node, dict):
-            raise InputError(f"{where}: {dotted(loc)} holds a value, not keys", "shorten the path")
+            raise InputError(
+                f"{location}: {dotted(loc)} holds a value, not keys", "shorten the path"
+            )
         elif n < len(keys):
             node.setdefault(key, {})
         loc = (*loc, step)
@@ -378,14 +380,14 @@ def validate(model: type[M], document: Document) -> M:
         is_missing = problem["type"] == "missing"
         placed.append((is_missing, document.mark(loc), len(placed), loc, problem))
     placed.sort(key=lambda place: place[:3])
-    shown = [
+    explanations = [
         (mark, *_explain(model, problem, loc))
         for _, mark, _, loc, problem in placed[:SHOWN_PROBLEMS]
     ]
-    mark, message, hint = shown[0]
+    mark, message, hint = explanations[0]
     if len(problems) > 1:
-        rest = "; ".join(f"{mark}: {message}" for mark, message, _ in shown[1:])
-        message = f"{shorten(message, 180)} (and {len(problems) - 1} more: {rest})"
+        further_text = "; ".join(f"{mark}: {message}" for mark, message, _ in explanations[1:])
+        message = f"{shorten(message, 180)} (and {len(problems) - 1} more: {further_text})"
     raise InputError(f"{mark}: {message}", hint)
 
 
@@ -421,8 +423,8 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
         message, _, hint = str(context["error"]).partition(" | ")
         return f"{name}: {message}", hint or "correct the value"
     value = problem["input"]
-    found = "is empty" if value is None else f"= {shorten(repr(value), 80)}"
-    return f"{name} {found}", f"Give {wanted_of(problem)}."
+    content = "is empty" if value is None else f"= {shorten(repr(value), 80)}"
+    return f"{name} {content}", f"Give {wanted_of(problem)}."
 
 
 def _nearest(name: str, choices: Sequence[str]) -> str:

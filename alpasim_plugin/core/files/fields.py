@@ -42,8 +42,8 @@ class Fields:
         Args:
             met: Names of fields, once for each time that a file has them.
         """
-        known = self.names() | self.names(harmless=True)
-        unread = Counter(name for name in met if name not in known)
+        expected_names = self.names() | self.names(harmless=True)
+        unread = Counter(name for name in met if name not in expected_names)
         if not unread:
             return ()
         frequent = sorted(unread, key=lambda name: (-unread[name], name))

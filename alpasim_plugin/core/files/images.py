@@ -65,7 +65,7 @@ def image_fault(data: bytes) -> str | None:
     return None
 
 
-def check_image(data: bytes, where: Path | str, do_this: str = GIVE) -> tuple[int, int]:
+def check_image(data: bytes, location: Path | str, do_this: str = GIVE) -> tuple[int, int]:
     """Return width and height of an encoded image.
 
     Raises:
@@ -74,20 +74,20 @@ def check_image(data: bytes, where: Path | str, do_this: str = GIVE) -> tuple[in
     size = image_size(data)
     if size is None:
         raise InputError(
-            f"{where}: {len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
+            f"{location}: {len(data)} bytes beginning {data[:4]!r}, no PNG or JPEG", do_this
         )
     for side in size:
-        STORED_SIDE_PX.check(side, where)
-    STORED_PIXELS.check(size[0] * size[1], where)
+        STORED_SIDE_PX.check(side, location)
+    STORED_PIXELS.check(size[0] * size[1], location)
     return size
 
 
-def decode_image(data: bytes, where: Path | str, do_this: str = GIVE, flag: int = 1) -> Any:
+def decode_image(data: bytes, location: Path | str, do_this: str = GIVE, flag: int = 1) -> Any:
     """Decode a PNG or JPEG as OpenCV does.
 
     Args:
         data: The encoded image.
-        where: Its file, for messages.
+        location: Its file, for messages.
         do_this: Hint of the errors.
         flag: ``cv2.IMREAD_...``; by default colour, ``(H, W, 3)`` uint8 BGR.
 
@@ -96,11 +96,11 @@ def decode_image(data: bytes, where: Path | str, do_this: str = GIVE, flag: int 
     """
     import cv2
 
-    check_image(data, where, do_this)
-    with parsing(where, do_this, "no readable image"):
+    check_image(data, location, do_this)
+    with parsing(location, do_this, "no readable image"):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
     if image is None:
-        raise InputError(f"{where}: {len(data)} bytes that do not decode", do_this)
+        raise InputError(f"{location}: {len(data)} bytes that do not decode", do_this)
     return image
 
 

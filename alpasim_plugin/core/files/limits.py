@@ -25,13 +25,13 @@ class Bound:
         """Return whether a value is in the range; NaN never is."""
         return self.low <= value <= self.high
 
-    def check(self, value: float, where: object, what: str = "") -> None:
+    def check(self, value: float, location: object, quantity: str = "") -> None:
         """Refuse a value outside the range.
 
         Args:
             value: In the bound's unit.
-            where: File and place that the value stands in.
-            what: Its name there; by default the quantity's.
+            location: File and place that the value stands in.
+            quantity: Its name there; by default the quantity's.
 
         Raises:
             InputError: It is outside, or NaN.
@@ -39,7 +39,7 @@ class Bound:
         if not self.holds(value):
             unit = f" {self.unit}" if self.unit else ""
             raise InputError(
-                f"{where}: {what or self.name} = {number(value)}{unit}, outside {self.range_text}",
+                f"{location}: {quantity or self.name} = {number(value)}{unit}, outside {self.range_text}",
                 f"correct it: {self.reason}",
             )
 

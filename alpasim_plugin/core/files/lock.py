@@ -33,7 +33,7 @@ class Held:
 @contextmanager
 def one_writer(
     path: Path,
-    what: str,
+    target: str,
     wait: bool = False,
     waiting: Callable[[str], None] = warn,
     do_this: str | None = None,
@@ -42,7 +42,7 @@ def one_writer(
 
     Args:
         path: The lock file; its folder is made if it does not exist.
-        what: What is written under the lock, for errors.
+        target: What is written under the lock, for errors.
         wait: Wait until it is free; otherwise refuse.
         waiting: Called once with a line that says what is waited for.
         do_this: Advice where the folder cannot be written; None: one that follows from the cause.
@@ -66,10 +66,10 @@ def one_writer(
         except Timeout:
             if not wait:
                 raise InfrastructureError(
-                    f"{what}: another process is writing it",
+                    f"{target}: another process is writing it",
                     "wait until it ends, or name another folder",
                 ) from None
-            waiting(f"waiting: another process writes {what}")
+            waiting(f"waiting: another process writes {target}")
             lock.acquire()
         os.utime(path)
         held = Held(path, path.stat().st_mtime_ns)

@@ -174,16 +174,16 @@ def read_text(path: Path | str, bound: Bound = FILE_BYTES, do_this: str = CHECK_
 
 @contextmanager
 def parsing(
-    where: Path | str, do_this: str = FETCH_AGAIN, what: str = "it cannot be used"
+    location: Path | str, do_this: str = FETCH_AGAIN, problem: str = "it cannot be used"
 ) -> Iterator[None]:
     """Turn whatever a parser raises into an error that names the file that it parses.
 
     The original stays the cause, so ``--debug`` shows where it was raised.
 
     Args:
-        where: The file, or the member of a file.
+        location: The file, or the member of a file.
         do_this: Hint.
-        what: What is wrong if anything is: "no readable parquet".
+        problem: What is wrong if anything is: "no readable parquet".
 
     Raises:
         InputError: The block raised anything but a `SimrunError`.
@@ -196,22 +196,22 @@ def parsing(
         reason = str(error).strip().partition("\n")[0]
         if isinstance(error, KeyError) or not reason:
             reason = f"{type(error).__name__} {error}"
-        raise InputError(f"{where}: {what}: {reason}", do_this) from error
+        raise InputError(f"{location}: {problem}: {reason}", do_this) from error
 
 
-def parse_json(data: bytes | str, where: Path | str, do_this: str = FETCH_AGAIN) -> Any:
+def parse_json(data: bytes | str, location: Path | str, do_this: str = FETCH_AGAIN) -> Any:
     """Return the plain data of a JSON document.
 
     Args:
         data: The document, UTF-8.
-        where: Its file, for messages.
+        location: Its file, for messages.
         do_this: Hint of the errors.
 
     Raises:
         InputError: Not JSON, nested too deep, a number that is not finite (JSON has no NaN), or
             half a surrogate pair, which no file can be written with.
     """
-    with parsing(where, do_this, "broken JSON"):
+    with parsing(location, do_this, "broken JSON"):
         value = json.loads(data)
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # numbers and text as above
     return value
@@ -245,12 +245,14 @@ def read_json_lines(path: Path | str, do_this: str = FETCH_AGAIN) -> list[JsonOb
     rows = []
     for n, line in enumerate(read_bytes(path, JSON_BYTES, do_this).splitlines(), 1):
         if line.strip():
-            where = f"{path}:{n}"
-            rows.append(as_shape(JsonObject, parse_json(line, where, do_this), where, do_this))
+            location = f"{path}:{n}"
+            rows.append(
+                as_shape(JsonObject, parse_json(line, location, do_this), location, do_this)
+            )
     return rows
 
 
-def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str = FETCH_AGAIN) -> T:
+def as_shape(shape: type[T], value: Any, location: Path | str, do_this: str = FETCH_AGAIN) -> T:
     """Return plain data, as it is, after checking that it has a shape.
 
     Args:
@@ -258,7 +260,7 @@ def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str = FETCH
             or a type such as ``dict[str, str]``. Types are strict: no text for a number, no list
             for an object. Members that it does not name are not looked at.
         value: Plain data.
-        where: Its file, for messages.
+        location: Its file, for messages.
         do_this: Hint of the error.
 
     Raises:
@@ -269,18 +271,20 @@ def as_shape(shape: type[T], value: Any, where: Path | str, do_this: str = FETCH
     try:
         _adapter(cast(Hashable, shape)).validate_python(value, strict=True)
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(error)}", do_this) from None
+        raise InputError(f"{location}: {_first_problem(error)}", do_this) from None
     return cast("T", value)
 
 
-def read_record(record: type[T], data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> T:
+def read_record(
+    record: type[T], data: bytes, location: Path | str, do_this: str = FETCH_AGAIN
+) -> T:
     """Return the record that a JSON document holds.
 
     Args:
         record: A frozen dataclass; its members may be dataclasses, dictionaries and tuples of them.
             Types are strict. Members of the document that it does not name are not looked at.
         data: The document, as `parse_json` accepts it.
-        where: Its file, for messages.
+        location: Its file, for messages.
         do_this: Hint of the error.
 
     Raises:
@@ -291,7 +295,7 @@ def read_record(record: type[T], data: bytes, where: Path | str, do_this: str = 
     try:
         return cast("T", _adapter(cast(Hashable, record)).validate_json(data, strict=True))
     except ValidationError as error:
-        raise InputError(f"{where}: {_first_problem(error)}", do_this) from None
+        raise InputError(f"{location}: {_first_problem(error)}", do_this) from None
 
 
 def _first_problem(error: ValidationError) -> str:
@@ -303,7 +307,8 @@ def _first_problem(error: ValidationError) -> str:
     return f"{member}: {kind_of(first['input'])}, wanted {wanted_of(first)}"
 
 
-WANTED = {  # type of a problem that pydantic finds -> what it wants instead
+# type of a problem that pydantic finds -> what it wants instead
+WANTED = {
     "string_type": "text",
     "int_type": "an integer",
     "int_from_float": "an integer",
@@ -357,7 +362,7 @@ def kind_of(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def parse_xml(data: bytes, where: Path | str) -> ElementTree.Element:
+def parse_xml(data: bytes, location: Path | str) -> ElementTree.Element:
     """Return the root of an XML document; a DOCTYPE is refused, so no entity can be defined or
     expanded.
 
@@ -370,7 +375,7 @@ def parse_xml(data: bytes, where: Path | str) -> ElementTree.Element:
 
     def refuse(*_: Any) -> None:
         raise InputError(
-            f"{where}: a DOCTYPE declaration",
+            f"{location}: a DOCTYPE declaration",
             "remove it: entities are not accepted in scenario files",
         )
 
@@ -378,8 +383,8 @@ def parse_xml(data: bytes, where: Path | str) -> ElementTree.Element:
         nonlocal depth, count
         depth += 1
         count += 1
-        DEPTH.check(depth, where)
-        XML_ELEMENTS.check(count, where)
+        DEPTH.check(depth, location)
+        XML_ELEMENTS.check(count, location)
 
     def end(*_: Any) -> None:
         nonlocal depth
@@ -389,12 +394,12 @@ def parse_xml(data: bytes, where: Path | str) -> ElementTree.Element:
     scout.StartDoctypeDeclHandler = refuse
     scout.StartElementHandler = begin
     scout.EndElementHandler = end
-    with parsing(where, FETCH_AGAIN, "malformed XML"):
+    with parsing(location, FETCH_AGAIN, "malformed XML"):
         scout.Parse(data, True)
         return ElementTree.fromstring(data)
 
 
-def unzstd(data: bytes, expected: int, where: Path | str, do_this: str = FETCH_AGAIN) -> bytes:
+def unzstd(data: bytes, expected: int, location: Path | str, do_this: str = FETCH_AGAIN) -> bytes:
     """Unpack a zstd frame of a size that is known.
 
     Raises:
@@ -402,27 +407,27 @@ def unzstd(data: bytes, expected: int, where: Path | str, do_this: str = FETCH_A
     """
     import zstandard
 
-    UNPACKED_BYTES.check(expected, where)
-    with parsing(where, do_this, "damaged zstd data"):
+    UNPACKED_BYTES.check(expected, location)
+    with parsing(location, do_this, "damaged zstd data"):
         reader = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data)
         unpacked = reader.read(expected + 1)
     if len(unpacked) != expected:
-        raise InputError(f"{where}: zstd data of another size than {expected} bytes", do_this)
+        raise InputError(f"{location}: zstd data of another size than {expected} bytes", do_this)
     return unpacked
 
 
-def check_names(names: list[str], where: Path | str) -> None:
+def check_names(names: list[str], location: Path | str) -> None:
     """Refuse the members of an archive if one could leave it, two share a name, or there are too
     many.
 
     Raises:
         InputError: They do.
     """
-    MEMBERS.check(len(names), where)
+    MEMBERS.check(len(names), location)
     if len(set(names)) < len(names):
-        raise InputError(f"{where}: two members of one name", "write the archive again")
+        raise InputError(f"{location}: two members of one name", "write the archive again")
     for name in names:
         if name.startswith("/") or "\\" in name or ".." in name.split("/") or "\0" in name:
             raise InputError(
-                f"{where}: a member named {name!r}, outside the archive", "do not use this file"
+                f"{location}: a member named {name!r}, outside the archive", "do not use this file"
             )

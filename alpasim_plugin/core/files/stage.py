@@ -33,8 +33,8 @@ def announce(text: str) -> None:
 
 def stages_in(folder: Path) -> list[str]:
     """Return what the processes that write into a folder do."""
-    found = []
+    stages = []
     for path in sorted(folder.glob("*")):
         with suppress(SimrunError):  # its process has ended just now
-            found.append(read_text(path))
-    return found
+            stages.append(read_text(path))
+    return stages

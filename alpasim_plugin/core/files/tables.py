@@ -37,12 +37,12 @@ def read_parquet(
     return table
 
 
-def parse_parquet(data: bytes, where: Path | str, do_this: str = FETCH_AGAIN) -> Any:
+def parse_parquet(data: bytes, location: Path | str, do_this: str = FETCH_AGAIN) -> Any:
     """Return a parquet document as an Arrow table; see `read_parquet`."""
     import pyarrow as pa
 
-    file = _open(pa.BufferReader(data), where, do_this)
-    with parsing(where, do_this, NO_PARQUET):
+    file = _open(pa.BufferReader(data), location, do_this)
+    with parsing(location, do_this, NO_PARQUET):
         table = file.read()
         table.validate(full=True)
     return table
@@ -59,33 +59,33 @@ def check_parquet(
     return list(empty.column_names)
 
 
-def _open(source: Any, where: Path | str, do_this: str) -> Any:
+def _open(source: Any, location: Path | str, do_this: str) -> Any:
     """Open a parquet file; refuse more rows, columns or unpacked bytes than the bounds, by its
     header.
     """
     import pyarrow.parquet as pq
 
-    if source is where:
+    if source is location:
         check_regular(source, do_this=do_this)
-    with parsing(where, do_this, NO_PARQUET):
+    with parsing(location, do_this, NO_PARQUET):
         file = pq.ParquetFile(source, page_checksum_verification=True)
         facts = file.metadata
-        TABLE_ROWS.check(facts.num_rows, where)
-        TABLE_COLUMNS.check(facts.num_columns, where)
+        TABLE_ROWS.check(facts.num_rows, location)
+        TABLE_COLUMNS.check(facts.num_columns, location)
         size = 0
         for i in range(facts.num_row_groups):
             for j in range(facts.num_columns):
                 chunk = facts.row_group(i).column(j)
                 # Runs of equal values take no space in the file: what they become in memory counts.
                 size += max(chunk.total_uncompressed_size, 8 * chunk.num_values)
-        TABLE_BYTES.check(size, where)
+        TABLE_BYTES.check(size, location)
     return file
 
 
 def check_columns(
     table: Any,
     columns: Mapping[str, Kind],
-    where: Path | str,
+    location: Path | str,
     do_this: str = FETCH_AGAIN,
 ) -> None:
     """Refuse a table that lacks a column, has it twice, or has one of another type.
@@ -104,10 +104,12 @@ def check_columns(
     names = table.column_names
     for name, kind in columns.items():
         if names.count(name) != 1:
-            found = "several columns" if name in names else "no column"
-            raise InputError(f"{where}: {found} {name!r} among {', '.join(names[:12])}", do_this)
+            count_text = "several columns" if name in names else "no column"
+            raise InputError(
+                f"{location}: {count_text} {name!r} among {', '.join(names[:12])}", do_this
+            )
         type_ = table.schema.field(name).type
         held = type_.value_type if t.is_dictionary(type_) else type_
         # A column of nothing but nulls has a type of its own.
         if not any(test(held) for test in (t.is_null, *tests[kind])):
-            raise InputError(f"{where}: column {name!r} of {type_}, wanted {kind}", do_this)
+            raise InputError(f"{location}: column {name!r} of {type_}, wanted {kind}", do_this)

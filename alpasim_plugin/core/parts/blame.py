@@ -64,8 +64,8 @@ def blaming(
             raise
         if isinstance(error, SimrunError) and _is_known(error, kind):
             raise
-        own = kind(f"{name}: {raised(error, called)}", TRACEBACK)
-        raise (damaged_kernels(error) or own) from error
+        fault = kind(f"{name}: {raised(error, called)}", TRACEBACK)
+        raise (damaged_kernels(error) or fault) from error
 
 
 def _is_known(error: SimrunError, kind: type[SimrunError]) -> bool:
@@ -92,11 +92,11 @@ def raised(error: BaseException, called: str = "") -> str:
     chosen = [*outside[:1], *users[-1:]]
     if not chosen and not called and not isinstance(error, SyntaxError):
         chosen = frames[-1:]
-    where = called
+    location = called
     if chosen:
-        where = f" at {chosen[-1].filename}:{chosen[-1].lineno}, in {chosen[-1].name}"
+        location = f" at {chosen[-1].filename}:{chosen[-1].lineno}, in {chosen[-1].name}"
     text = re.sub(r"simrun_file_\w{12}", "the file", str(error))  # as a file is imported
-    return f"{type(error).__name__}{text and f': {text}'}{where}"
+    return f"{type(error).__name__}{text and f': {text}'}{location}"
 
 
 def is_own(part: Any) -> bool:
@@ -130,7 +130,9 @@ def defined(part: Any, method: str) -> str:
 
 HEAD = struct.Struct("=Bdi")  # whether the part is at work, since when, bytes of text
 NOTE_BYTES = 4096
-NOBODY, AT_WORK, CALLED = range(3)
+NOBODY = 0
+AT_WORK = 1
+CALLED = 2
 FORKED = 70  # exit code of a copy of this process that a part made and let out (EX_SOFTWARE)
 
 
@@ -152,10 +154,10 @@ class Culprit:
     is_at_work: bool
     since_s: float
 
-    def error(self, what: str) -> SimrunError:
+    def error(self, fate: str) -> SimrunError:
         """Return the part's error for what became of its process."""
         return self.kind(
-            f"{self.name}: {what}{self.called}",
+            f"{self.name}: {fate}{self.called}",
             "Correct the part: it may raise, but not end or leave its process.",
         )
 

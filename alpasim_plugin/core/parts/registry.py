@@ -16,9 +16,8 @@ from alpasim_plugin.core.lazy import installed_points
 from alpasim_plugin.core.parts.spec import KINDS, KindName
 
 LISTS = "simrun.parts"  # entry points, each a sequence of `RegisteredPart`
-DEFAULT_SETTINGS = (
-    "simrun.default_settings"  # entry points by kind: settings of parts that name none
-)
+# entry points by kind: settings of parts that name none
+DEFAULT_SETTINGS = "simrun.default_settings"
 
 
 @dataclass(frozen=True)

@@ -52,13 +52,13 @@ def find(kind: KindName, name: str) -> RegisteredPart:
     Raises:
         InputError: Unknown name (with the nearest known one), or a name claimed twice.
     """
-    known = entries(kind)
-    if name in known:
-        return known[name]
-    raise _unknown(kind, name, known)
+    choices = entries(kind)
+    if name in choices:
+        return choices[name]
+    raise _unknown(kind, name, choices)
 
 
-def _unknown(kind: str, name: str, known: Collection[str]) -> InputError:
+def _unknown(kind: str, name: str, choices: Collection[str]) -> InputError:
     file = Path(name if name.endswith(".py") else f"{name}.py")
     if name.endswith(".py") or os.path.isfile(file):
         if not os.path.isfile(file):
@@ -79,16 +79,13 @@ def _unknown(kind: str, name: str, known: Collection[str]) -> InputError:
             )
     return InputError(
         f"name {name!r}: no {kind} has that name",
-        f"{guess(name, known)}known: {', '.join(known)}; or name one of your own as package.module:Class",
+        f"{guess(name, choices)}known: {', '.join(choices)}; or name one of your own as package.module:Class",
     )
 
 
 BASE = "3dgs"  # the renderer below a fixer where nothing else is said
-PLAIN_KINDS = (
-    "renderer",
-    "evaluator",
-    "controller",
-)  # whose shipped parts declare nothing; a test holds them to it
+# whose shipped parts declare nothing; a test holds them to it
+PLAIN_KINDS = ("renderer", "evaluator", "controller")
 
 
 @dataclass(frozen=True)
@@ -115,14 +112,14 @@ class RendererSpec:
 
 
 def require_installed(
-    names_in_file: Iterable[str | None], where: Path | str, named: Collection[str | None] = ()
+    names_in_file: Iterable[str | None], location: Path | str, named: Collection[str | None] = ()
 ) -> None:
     """Refuse names of parts that a file holds, unless the parts are installed: a file is data, and
     what it names does not run.
 
     Args:
         names_in_file: Names of parts as `resolve` and `resolve_renderer` take them; None is no name.
-        where: The file, for messages.
+        location: The file, for messages.
         named: What the user named on the command line; it may be the same.
 
     Raises:
@@ -132,7 +129,7 @@ def require_installed(
     for name in names_in_file:
         if name is not None and name not in named and ":" in split_settings(name)[0]:
             raise InputError(
-                f"{where}: it names {name}, which is not installed; nothing runs because a file names it",
+                f"{location}: it names {name}, which is not installed; nothing runs because a file names it",
                 "name it on the command line if you trust it and the command has an option for it",
             )
 
@@ -167,10 +164,10 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     if is_target(name):
         target = absolute_target(name)
     else:
-        scheme, rest = split_address(name)
+        scheme, remote_address = split_address(name)
         if scheme:
             plain = scheme
-            address = rest
+            address = remote_address
         elif kind == "fixer":
             plain, steps = split_steps(name)
         target = find(kind, plain).target
@@ -211,12 +208,12 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
             without the weights that it needs.
     """
     parsed = parse_renderer(name)
-    own = parsed.settings
+    bracket_settings = parsed.settings
     base = parsed.base
     front = f"{parsed.part}@{parsed.steps}" if parsed.steps else parsed.part
     renderers = entries("renderer")
     if not base and (front in renderers or "://" in front or _is_renderer(front)):
-        if own:
+        if bracket_settings:
             raise InputError(
                 f"renderer {name!r}: {front!r} is no fixer: it has no settings for brackets",
                 "leave the brackets out, or name a fixer: onefixer[references=0]",
@@ -229,9 +226,9 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
                 f"renderer {name!r}: the fixer stands before the renderer", f"Write {base}+{front}."
             )
         raise _unknown("renderer or fixer", front, [*renderers, *fixers])
-    fixer = resolve("fixer", front, (*overrides_of(name, overrides), *own))
-    if own:
-        fixer = replace(fixer, name=f"{fixer.name}[{','.join(own)}]")
+    fixer = resolve("fixer", front, (*overrides_of(name, overrides), *bracket_settings))
+    if bracket_settings:
+        fixer = replace(fixer, name=f"{fixer.name}[{','.join(bracket_settings)}]")
     settings: Any = fixer.settings
     if getattr(settings, "is_offline", False):
         raise InputError(
@@ -292,8 +289,8 @@ def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
         ('precision=bf16', 'window=2')
     """
     named = [split_label(text) for text in overrides]
-    own = (text for label, text in named if label == renderer)
-    return (*(text for label, text in named if not label), *own)
+    specific = (text for label, text in named if label == renderer)
+    return (*(text for label, text in named if not label), *specific)
 
 
 def split_steps(name: str) -> tuple[str, int | None]:
@@ -303,13 +300,13 @@ def split_steps(name: str) -> tuple[str, int | None]:
         >>> split_steps("onefixer@2"), split_steps("onefixer")
         (('onefixer', 2), ('onefixer', None))
     """
-    plain, at, count = name.partition("@")
-    if at and not re.fullmatch("[1-9][0-9]?", count):
+    plain, separator, count = name.partition("@")
+    if separator and not re.fullmatch("[1-9][0-9]?", count):
         raise InputError(
             f"name {name!r}: {count!r} after @ is no step count",
             "write NAME@STEPS, such as onefixer@2",
         )
-    return plain, int(count) if at else None
+    return plain, int(count) if separator else None
 
 
 def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
@@ -321,11 +318,11 @@ def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
     files = getattr(factory, "files", {})
     if not isinstance(files, Mapping):
         files = {str(path): Path(path) for path in files}
-    given = {
+    attributes = {
         key: getattr(factory, key, None) for key in ("trained", "note", "is_remote", "missing")
     }
     stated: dict[str, Any] = {
-        key: value for key, value in given.items() if isinstance(value, bool | str)
+        key: value for key, value in attributes.items() if isinstance(value, bool | str)
     }
     return Declaration(files=files, **stated)
 

@@ -93,20 +93,20 @@ def _reached(start: str, everywhere: bool) -> set[str]:
     elsewhere and are not installed as well.
     """
     root = top_folder(start)
-    own = Path(os.path.relpath(start, root)).parts[0].removesuffix(".py")
+    package = Path(os.path.relpath(start, root)).parts[0].removesuffix(".py")
     is_shared = not INSTALLED.isdisjoint(Path(root).parts)
     folders: dict[str, str | None] = {}  # first name of a module that lies elsewhere -> its root
-    seen: set[str] = set()
+    visited: set[str] = set()
     todo = [(start, root)]
     while todo:
         path, base = todo.pop()
-        if path in seen:
+        if path in visited:
             continue
-        seen.add(path)
+        visited.add(path)
         for module in _imports(path, base):
             name = module[0]
             lies_here = base == root and (
-                name == own or not (is_shared or _is_installed(name, root))
+                name == package or not (is_shared or _is_installed(name, root))
             )
             folder: str | None = root if lies_here else None
             if not lies_here and everywhere:
@@ -116,7 +116,7 @@ def _reached(start: str, everywhere: bool) -> set[str]:
             if folder is not None:
                 files = (module_file(folder, module[:n]) for n in range(1, len(module) + 1))
                 todo += [(found, folder) for found in files if found is not None]
-    return seen
+    return visited
 
 
 def _folder_elsewhere(name: str) -> str | None:
@@ -207,8 +207,8 @@ def split_address(name: str) -> tuple[str, str]:
     """
     if name.startswith(COMMAND):
         return COMMAND, name.removeprefix(COMMAND)
-    scheme, slashes, rest = name.partition("://")
-    return (scheme + slashes, rest) if slashes else ("", "")
+    scheme, slashes, address = name.partition("://")
+    return (scheme + slashes, address) if slashes else ("", "")
 
 
 def absolute_target(target: str) -> str:
@@ -244,7 +244,7 @@ def load(target: str, kind: str) -> Any:
         if name.endswith(".py") and not os.path.isfile(name):
             raise no_such_file(kind, Path(name))
         module = importlib.import_module(make_importable(target))
-        found = getattr(module, attribute, None)  # a module of a file runs here
+        member = getattr(module, attribute, None)  # a module of a file runs here
     except InputError:
         raise
     except BaseException as error:  # whatever a user's module raises while it is imported
@@ -252,16 +252,16 @@ def load(target: str, kind: str) -> Any:
             raise
         hint = IN_A_FILE if name.endswith(".py") else DO_THIS
         raise InputError(f"{kind} {target!r}: {raised(error)}", hint) from error
-    if found is None:
+    if member is None:
         classes = {key: value for key, value in vars(module).items() if inspect.isclass(value)}
-        own = [key for key, value in classes.items() if value.__module__ == module.__name__]
-        has = own or [*classes]
-        near = difflib.get_close_matches(attribute, has, 3, 0.0)
+        own_classes = [key for key, value in classes.items() if value.__module__ == module.__name__]
+        choices = own_classes or [*classes]
+        near = difflib.get_close_matches(attribute, choices, 3, 0.0)
         raise InputError(
             f"{kind} {target!r}: {name} has no {attribute!r}",
             f"Name one of its classes: {', '.join(near) or 'it has none'}.",
         )
-    return found
+    return member
 
 
 def no_such_file(kind: str, file: Path) -> InputError:
@@ -316,9 +316,9 @@ def make_importable(target: str) -> str:
         parts.pop()
     if len(parts) > 1 and _served.get(parts[0]) == module_file(root, parts[:1]):
         return ".".join(parts)
-    own = f"simrun_file_{hashlib.sha256(file.encode()).hexdigest()[:12]}"
-    _serve(own, file)
-    return own
+    module_name = f"simrun_file_{hashlib.sha256(file.encode()).hexdigest()[:12]}"
+    _serve(module_name, file)
+    return module_name
 
 
 def _serve(name: str, file: str | None) -> None:

@@ -118,8 +118,8 @@ class PartSpec:
     @property
     def label(self) -> str:
         """Give the part and its weights in a few words: "onefixer, trained"."""
-        own = getattr(self.settings, "name", "") or self.name
-        return f"{own}, {self.note}" if self.note else own
+        name = getattr(self.settings, "name", "") or self.name
+        return f"{name}, {self.note}" if self.note else name
 
     @property
     def unseen(self) -> str:
@@ -153,9 +153,9 @@ class PartSpec:
         return _restored, (self.target, pickle.dumps(dict(vars(self))))
 
 
-def _restored(target: str, rest: bytes) -> PartSpec:
+def _restored(target: str, pickled_fields: bytes) -> PartSpec:
     make_importable(target)
-    return PartSpec(**pickle.loads(rest))
+    return PartSpec(**pickle.loads(pickled_fields))
 
 
 def digest(value: object) -> str:
@@ -187,12 +187,13 @@ def part_digest(
     return digest([[code_digest(module) for module in modules], attribute, content, dict(files)])
 
 
+# whose failure it is; a controller or source that cannot be made is bad input
 ERRORS: dict[str, type[SimrunError]] = {
     "renderer": RendererFault,
     "fixer": FixerFault,
     "policy": PolicyError,
     "evaluator": EvaluatorError,
-}  # whose failure it is; a controller or source that cannot be made is bad input
+}
 
 
 def error_of(spec: PartSpec) -> type[SimrunError]:
@@ -202,14 +203,14 @@ def error_of(spec: PartSpec) -> type[SimrunError]:
     return ERRORS.get(spec.kind, InputError)
 
 
-def build(spec: PartSpec, **known: Any) -> Any:
+def build(spec: PartSpec, **arguments: Any) -> Any:
     """Make a part.
 
     Args:
         spec: The resolved part.
-        known: What the factory may ask for by naming a parameter so, in a user's part data that it
-            cannot change;
-            `alpasim_plugin.core.parts.spec` lists the names by kind.
+        arguments: Values by name; the factory is given those that its parameters are named after.
+            A user's part cannot change them. `alpasim_plugin.core.parts.spec` lists the names by
+            kind.
 
     Raises:
         InputError: The import fails, the factory asks for something else, or what it makes lacks a
@@ -218,11 +219,11 @@ def build(spec: PartSpec, **known: Any) -> Any:
     """
     kind = KINDS[spec.kind]
     if spec.is_users:
-        known = {name: shielded(value) for name, value in known.items()}
-    known = {"settings": spec.settings, "address": spec.address} | known
+        arguments = {name: shielded(value) for name, value in arguments.items()}
+    arguments = {"settings": spec.settings, "address": spec.address} | arguments
     factory = load(spec.target, spec.kind)
     wanted = _arguments(
-        factory, spec, {key: value for key, value in known.items() if key in kind.arguments}
+        factory, spec, {key: value for key, value in arguments.items() if key in kind.arguments}
     )
     name = f"{spec.kind} {spec.name!r}"
     with blaming(error_of(spec), name, "", spec.is_users):
@@ -230,7 +231,7 @@ def build(spec: PartSpec, **known: Any) -> Any:
 
 
 def _arguments(
-    factory: Callable[..., Any], spec: PartSpec, known: dict[str, Any]
+    factory: Callable[..., Any], spec: PartSpec, values: dict[str, Any]
 ) -> dict[str, Any]:
     """Choose what a factory asks for by the names of its parameters.
 
@@ -242,12 +243,14 @@ def _arguments(
         parameters = inspect.signature(factory).parameters.values()
     except ValueError:  # some built-in callables have no signature
         return {}
-    asked = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    by_name = {p.name: p for p in asked if p.kind is not p.POSITIONAL_ONLY and p.name in known}
-    unknown = [p.name for p in asked if p.default is p.empty and p.name not in by_name]
+    named_parameters = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_name = {
+        p.name: p for p in named_parameters if p.kind is not p.POSITIONAL_ONLY and p.name in values
+    }
+    unknown = [p.name for p in named_parameters if p.default is p.empty and p.name not in by_name]
     if unknown:
         raise contract_error(spec.kind)(
             f"{spec.kind} {spec.name!r}: its factory asks for {', '.join(unknown)}",
             f"give the parameter a default; a {spec.kind} may ask for {', '.join(KINDS[spec.kind].arguments) or 'nothing'}",
         )
-    return {name: known[name] for name in by_name}
+    return {name: values[name] for name in by_name}
