@@ -100,7 +100,7 @@ def _transforms(folder: Path, need_files: bool) -> SourceDrive:
         notes += [note for _, note in ordered]
     elif without:
         raise InputError(
-            f"{without[0].where}: no t_us, which other photographs have",
+            f"{without[0].location}: no t_us, which other photographs have",
             "give every photograph its time, or none",
         )
     photographs = [one for one in every if one.file in files]

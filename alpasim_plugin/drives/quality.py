@@ -117,8 +117,8 @@ def write_page(
     for use, rows in comparisons.items():
         for i in _spread(len(rows), SHOWN):
             name = f"{IMAGES}/{use}-{rows[i].name}.jpg"
-            both = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
-            data = cv2.imencode(".jpg", np.ascontiguousarray(both[..., ::-1]))[1].tobytes()
+            pair = np.concatenate([rows[i].truth, rows[i].image], axis=0)
+            data = cv2.imencode(".jpg", np.ascontiguousarray(pair[..., ::-1]))[1].tobytes()
             write_bytes(folder / name, data)
             shown.append((use, rows[i], name))
     spread = [one.uncertainty_m for one in standing.obstacles]

@@ -144,7 +144,7 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
         first = drive.of(str(one.camera))[0].lens
         if size != (first.width, first.height):
             raise InputError(
-                f"{one.where}, {one.file}: {size} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
+                f"{one.location}, {one.file}: {size} pixels, others of the camera {one.camera!r} have {first.width}x{first.height}",
                 "give the photographs as they were, each with its camera's name",
             )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
@@ -183,7 +183,7 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
 
 def _two_units(one: PosedPhotograph, found: str) -> InputError:
     return InputError(
-        f"{one.where}, {one.file.name}: {found}",
+        f"{one.location}, {one.file.name}: {found}",
         "give all poses in one unit, metres, and one drive at a time",
     )
 
@@ -208,7 +208,7 @@ def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]
         counts = [len(camera) for camera in cameras]
         if len(set(counts)) > 1:
             raise InputError(
-                f"{cameras[0][0].where}: no times, and cameras of {counts} photographs whose names share no numbers",
+                f"{cameras[0][0].location}: no times, and cameras of {counts} photographs whose names share no numbers",
                 "give each photograph its time (t_us), or photographs of one time names of one number",
             )
         numbers = [list(range(count)) for count in counts]
