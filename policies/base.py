@@ -22,7 +22,9 @@ PLAN_STEP_US = 100_000
 MIN_CRUISE_MPS = 6.0  # where the drive begins at standstill there is no speed to keep
 MAX_LATERAL_MPS2 = 2.5  # comfort in curves
 COMFORT_BRAKE_MPS2 = 2.0  # before a curve
-ACCEL_MPS2, BRAKE_MPS2 = 1.5, 4.0  # towards a limit of speed
+# Towards a limit of speed
+ACCEL_MPS2 = 1.5
+BRAKE_MPS2 = 4.0
 MIN_LOOKAHEAD_M = 3.0
 CUT_M = 0.15
 LOOKAHEAD_S = 0.7

@@ -53,7 +53,9 @@ YAW_RAD = 0.7
 T_WORLD_ROAD = se2(1200.0, -800.0, YAW_RAD)
 LEAST_M = 0.5  # at the end of a plan: what is less says nothing of sides
 BEGIN_S = 0.3  # a plan's first part, in which a car hardly changes its speed
-LEAST_SHARE, MOST_SHARE = 0.65, 1.6  # of the ego's speed, with which a plan may begin
+# Of the ego's speed, with which a plan may begin
+LEAST_SHARE = 0.65
+MOST_SHARE = 1.6
 MOST_MPS = 25.0
 
 
@@ -235,10 +237,11 @@ class Report:
 
     checks: tuple[Check, ...]
     notes: tuple[Check, ...] = ()  # legal but unusual
+    # Median and worst policy query, the first excluded
     latency_ms: tuple[float, float] = (
         0.0,
         0.0,
-    )  # median and worst policy query, the first excluded
+    )
 
     @property
     def ok(self) -> bool:

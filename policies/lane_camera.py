@@ -47,10 +47,9 @@ from policies.obstacle_vision import (
 )
 from policies.road_vision import GroundGrid, PaintPoints, RidgeFilter, find_paint, make_grid
 
-NAVIGATION_SIGMA_M, NAVIGATION_LIMIT_M = (
-    0.7,
-    1.0,
-)  # a satellite receiver knows the lane, not the place in it
+# A satellite receiver knows the lane, not the place in it
+NAVIGATION_SIGMA_M = 0.7
+NAVIGATION_LIMIT_M = 1.0
 MIN_CRUISE_MPS = 8.0
 MAX_HEADING_RAD = 0.45  # a lane that points further away is not the ego's any more
 UNCERTAIN_M = 1.2

@@ -14,10 +14,9 @@ from policies.obstacle_vision import ObstacleTrack
 ROUTE_SIGMA_M = 0.75  # how far a lane's centre may lie from the route, for all the policy knows
 SAME_LANE_M = 1.5
 PATH_M = 70.0
-LEAVE_M, LEAVE_RAD = (
-    1.2,
-    0.2,
-)  # the route leaves the lane where it is this far off and points this much elsewhere
+# The route leaves the lane where it is this far off and points this much elsewhere
+LEAVE_M = 1.2
+LEAVE_RAD = 0.2
 LEAVE_BEFORE_M = 8.0
 
 HEADWAY_S = 1.3

@@ -151,7 +151,7 @@ class Learned(Policy):
         real = True  # every camera has an earlier frame
         for history in self.histories:
             t_us, now = history[-1]
-            earlier_us, earlier = min(history, key=lambda seen: abs(t_us - EARLIER_US - seen[0]))
+            earlier_us, earlier = min(history, key=lambda past: abs(t_us - EARLIER_US - past[0]))
             if t_us - earlier_us <= EARLIER_US // 2:
                 earlier = now
                 real = False
@@ -160,9 +160,8 @@ class Learned(Policy):
         state = [speed_mps / SPEED_UNIT_MPS, self.desired_mps / SPEED_UNIT_MPS, float(real)]
         threads = torch.get_num_threads()
         if threads != 1:
-            torch.set_num_threads(
-                1
-            )  # the order of summation in a convolution depends on the thread count
+            # The order of summation in a convolution depends on the thread count
+            torch.set_num_threads(1)
         try:
             with torch.no_grad():
                 numbers = upload(torch.tensor([state]), self.device)
@@ -199,10 +198,12 @@ class Learned(Policy):
             ]
         )
         over = np.maximum(progress - self.grid_m[-1], 0.0)  # straight beyond the last knot
-        at = [np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)]
+        pose_columns = [
+            np.interp(progress, self.grid_m, column) for column in (xy[:, 0], xy[:, 1], yaw)
+        ]
         return np.column_stack(
-            [at[0] + over * np.cos(yaw[-1]), at[1] + over * np.sin(yaw[-1])]
-        ), at[2]
+            [pose_columns[0] + over * np.cos(yaw[-1]), pose_columns[1] + over * np.sin(yaw[-1])]
+        ), pose_columns[2]
 
 
 class LearnedMean(Learned):

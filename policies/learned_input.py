@@ -101,7 +101,7 @@ def view_camera(scenario: Scenario, view: View) -> CameraSpec:
     middle = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
     pinholes = [camera for camera in scenario.cameras if camera.lens is None]
     nearness = {camera.name: float(camera.T_rig_camera[:3, 2] @ middle) for camera in pinholes}
-    for camera in sorted(pinholes, key=lambda one: (-nearness[one.name], one.name)):
+    for camera in sorted(pinholes, key=lambda pinhole: (-nearness[pinhole.name], pinhole.name)):
         if nearness[camera.name] > np.cos(np.deg2rad(SIDE_DEG)):
             return camera
     raise InputError(

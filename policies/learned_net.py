@@ -20,6 +20,7 @@ from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.types import F64
 from policies.learned_input import CHANNELS, COMMANDS, FRONT, View
 
+# Distances along the path of the predicted headings
 KNOTS_M = (
     2.0,
     4.0,
@@ -30,7 +31,7 @@ KNOTS_M = (
     30.0,
     42.0,
     60.0,
-)  # distances along the path of the predicted headings
+)
 TIMES_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)  # times of the predicted speeds
 STATES = 3  # speed and desired speed in `SPEED_UNIT_MPS`; 1 if there is an earlier frame, else 0
 SPEED_UNIT_MPS = 15.0
@@ -99,14 +100,14 @@ class LearnedNet(nn.Module):
         self.see = nn.Sequential(*_convolutions())
         self.word = nn.Embedding(len(COMMANDS), 16)
         self.state = nn.Sequential(nn.Linear(STATES, 32), nn.ReLU())
-        seen = 24 * (self.views[0].height // 16) * (self.views[0].width // 16)
+        image_features = 24 * (self.views[0].height // 16) * (self.views[0].width // 16)
         for view in self.views[1:2]:
             beside = 24 * (view.height // 16) * (view.width // 16)
             self.side_encoder = nn.Sequential(
                 *_convolutions(), nn.Linear(beside, SIDE_FEATURES), nn.ReLU()
             )
             self.crossing_head = nn.Linear(SIDE_FEATURES + 32, 2)
-        features = seen + SIDE_FEATURES * len(self.views[1:])
+        features = image_features + SIDE_FEATURES * len(self.views[1:])
         self.plan = nn.Sequential(
             nn.Linear(features + 16 + 32, 160), nn.ReLU(), nn.Linear(160, 128), nn.ReLU()
         )
@@ -129,13 +130,15 @@ class LearnedNet(nn.Module):
         """Predict from an image ``(B, 4, H, W)`` of each view, states ``(B, 3)`` and indices of
         commands ``(B,)``.
         """
-        seen = [self.see(images[0])]
-        known = self.state(state)
+        view_features = [self.see(images[0])]
+        state_features = self.state(state)
         crossing = [state.new_zeros(len(state), 0)]
         for view, image in zip(self.views[1:], images[1:], strict=True):
-            seen.append(self.side_encoder(image if view.yaw_deg > 0 else image.flip(-1)))
-            crossing.append(self.crossing_head(torch.cat([seen[-1], known], dim=1)))
-        features = torch.cat([*seen, known, self.word(command)], dim=1)
+            view_features.append(self.side_encoder(image if view.yaw_deg > 0 else image.flip(-1)))
+            crossing.append(
+                self.crossing_head(torch.cat([view_features[-1], state_features], dim=1))
+            )
+        features = torch.cat([*view_features, state_features, self.word(command)], dim=1)
         heading, speed, sigma, leader = self.out(self.plan(features)).split(_PARTS, dim=1)
         sigma = _MIN_SIGMA + 0.1 * torch.exp(sigma.clamp(-4.0, 3.0))
         leader = torch.stack([torch.sigmoid(leader[:, 0]), SPEED_UNIT_MPS * leader[:, 1]], dim=1)
@@ -207,10 +210,10 @@ def load_net(path: Path) -> LearnedNet:
     wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
     with parsing(path, "copy or train it again", "not a complete safetensors file"):
         state = load_file(str(path))
-    found = {name: tuple(value.shape) for name, value in state.items()}
-    if found != wanted:
+    shapes = {name: tuple(value.shape) for name, value in state.items()}
+    if shapes != wanted:
         odd = sorted(
-            name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)
+            name for name in wanted.keys() | shapes.keys() if wanted.get(name) != shapes.get(name)
         )
         raise InputError(
             f"{path}: {len(odd)} tensors that are missing, foreign or of another shape, first {odd[0]}",

@@ -12,7 +12,9 @@ from alpasim_plugin.core.types import F32, U8, CameraSpec
 from policies.learned_input import View, level_view, sampled_at
 
 PARTS = 32  # of a pixel, between which OpenCV interpolates
-MEAN, STD = 115.0, 64.0  # grey levels
+# Grey levels
+MEAN = 115.0
+STD = 64.0
 GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
 
 
@@ -54,10 +56,10 @@ class DeviceView:
     def __call__(self, image: Tensor) -> Tensor:
         """Cut the view."""
         whole = self.rows @ image.permute(2, 0, 1).float() @ self.columns.T
-        shown = F.grid_sample(
+        view = F.grid_sample(
             whole.round()[None], self.shares, padding_mode="border", align_corners=True
         )
-        return shown[0].round()
+        return view[0].round()
 
 
 def network_input(now: Tensor, before: Tensor) -> Tensor:

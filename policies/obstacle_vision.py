@@ -18,16 +18,14 @@ from policies.road_vision import CELL_M, GroundGrid
 
 STRIPS = 4
 CORRIDOR_HALF_M = 1.05  # half the ego's width: what stands outside can be passed
-EDGES_M = np.linspace(
-    CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1
-)  # of the strips, to the left of the path
+# Of the strips, to the left of the path
+EDGES_M = np.linspace(CORRIDOR_HALF_M, -CORRIDOR_HALF_M, STRIPS + 1)
 TALL = 0.8  # how high to look, as a share of the camera's height
 LOW = 0.35  # the least share required where a curve ends the line of sight
 LEAVE_LANE_M = 2.6
-NARROW_M, WIDE_M = (
-    0.35,
-    0.8,
-)  # thinner patches are lane markings: lines, and the bars of a crosswalk
+# Thinner patches are lane markings: lines, and the bars of a crosswalk
+NARROW_M = 0.35
+WIDE_M = 0.8
 ROAD_NEAR_M = 5.5
 ROAD_FAR_M = 12.0
 ROAD_HALF_M = 0.9
@@ -126,9 +124,8 @@ def find_foot(
     # Where the line of sight through each strip at row i leaves the lane, at a later row k: in a
     # curve, and to the sides.
     middle = centre_y[:, None] + 0.5 * (EDGES_M[1:] + EDGES_M[:-1]) - grid.camera_y
-    sight = middle[:, :, None] * (
-        distance / distance[:, None, None]
-    )  # (R, STRIPS, R); in place from here on, as it is large
+    # (R, STRIPS, R); in place from here on, as it is large
+    sight = middle[:, :, None] * (distance / distance[:, None, None])
     sight += grid.camera_y
     sight -= centre_y
     has_left = np.abs(sight, out=sight) > LEAVE_LANE_M
@@ -173,8 +170,8 @@ def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:
     anomaly in 0..1 that is at least so wide.
     """
     bar = np.ones((1, round(width_m / CELL_M) | 1), np.uint8)
-    seen = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
-    table = cv2.integral(seen, sdepth=cv2.CV_64F)
+    sight_values = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
+    table = cv2.integral(sight_values, sdepth=cv2.CV_64F)
     return np.divide(table, 255.0, out=table)
 
 

@@ -45,14 +45,12 @@ class GroundGrid:
     inside: Bool  # (R, C) the point is in the image
     pixel_m: F64  # (R,) width of one pixel on the ground
     row_m: F64  # (R,) length of one grid row along the road
-    camera_xz: tuple[
-        float, float
-    ]  # metres, rig: where along the rig the camera stands, and how high
+    # Metres, rig: where along the rig the camera stands, and how high
+    camera_xz: tuple[float, float]
     camera_y: float  # metres, rig
     focal_px: float
-    sight_index: npt.NDArray[
-        np.intp
-    ]  # (R, U) cell of the grid, counted row by row, that image column u sees on each row
+    # (R, U) cell of the grid, counted row by row, that image column u sees on each row
+    sight_index: npt.NDArray[np.intp]
 
     def warp(self, image: U8) -> U8:
         """Return the image over the grid ``(R, C, 3)`` or ``(R, C)``; 0 outside the image."""
@@ -113,7 +111,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
     y_camera = float(camera.T_rig_camera[1, 3])
     column = np.arange(camera.width) + 0.5 - camera.width / 2
     sight = (HALF_WIDTH_M - y_camera + column[None, :] * distance[:, None] / f) / CELL_M
-    seen = (
+    in_view = (
         np.clip(np.rint(sight), 0, len(y) - 1).astype(np.intp) + len(y) * np.arange(len(x))[:, None]
     )
     map_u = uv[..., 0].astype(np.float32)
@@ -130,7 +128,7 @@ def make_grid(camera: CameraSpec) -> GroundGrid:
         (x_camera, height),
         y_camera,
         f,
-        seen,
+        in_view,
     )
 
 
@@ -174,9 +172,10 @@ class RidgeFilter:
         half_m = np.maximum(PAINT_WIDTH_M / 2, 0.5 * grid.pixel_m)
         gap_m = half_m + np.maximum(0.15, grid.pixel_m)
         flank_m = np.maximum(0.3, grid.pixel_m)
+        # (R, 3) cells: half the stroke, start and length of a flank
         sizes = np.column_stack(
             (np.rint(half_m / CELL_M), np.rint(gap_m / CELL_M), np.rint(flank_m / CELL_M))
-        ).astype(np.intp)  # (R, 3) cells: half the stroke, start and length of a flank
+        ).astype(np.intp)
         starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
         # Rows of equal windows are neighbours, and a few runs of them make the grid.
         self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
@@ -274,9 +273,8 @@ def find_paint(
     smooth = cv2.blur(response, (1, 3))
     near = round(MERGE_M / CELL_M)
     peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))
-    spread = np.sort(smooth, axis=1)[
-        :, smooth.shape[1] // 2
-    ]  # the median, of an odd number of columns
+    # The median, of an odd number of columns
+    spread = np.sort(smooth, axis=1)[:, smooth.shape[1] // 2]
     threshold = np.maximum(MIN_CONTRAST, NOISE_FACTOR * spread)
     is_peak = (smooth >= peak) & (smooth > threshold[:, None])
     rows, cols = np.divmod(np.flatnonzero(is_peak), smooth.shape[1])

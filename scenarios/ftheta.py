@@ -206,9 +206,9 @@ def pixel_to_angle(camera: CameraSpec) -> F64:
         c, d, e = camera.lens.linear
         plane = offset @ np.linalg.inv([[c, d], [e, 1.0]]).T
         away = np.linalg.norm(plane, axis=1) / reach
-        radius = away[rays.seen]
-        across = np.linalg.norm(rays.ray[rays.seen, :2], axis=1)
-        angle = np.arctan2(across, rays.ray[rays.seen, 2])
+        radius = away[rays.visible]
+        across = np.linalg.norm(rays.ray[rays.visible, :2], axis=1)
+        angle = np.arctan2(across, rays.ray[rays.visible, 2])
     powers = np.stack([radius**k for k in range(1, DEGREE + 1)], axis=1)
     scaled = np.linalg.lstsq(powers, angle, rcond=None)[0]
     return np.concatenate([[0.0], scaled / reach ** np.arange(1, DEGREE + 1)])

@@ -31,9 +31,8 @@ from alpasim_plugin.core.errors import InputError
 
 BASE = 10000.0
 RopeTable = tuple[Tensor, Tensor]  # cos, sin: (L, head_width / 2) float32
-Attend = Callable[
-    [Tensor, Tensor, Tensor], Tensor
-]  # q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
+# q, k, v (B, L, heads, head_width) -> (B, L, heads * head_width)
+Attend = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def axis_widths(head_width: int) -> tuple[int, int, int]:

@@ -41,11 +41,12 @@ from alpasim_plugin.block_fixers.sizes import HINT, MASK_CHANNELS, DiTSizes, rea
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers.network import checkpoints
 
+# Height, width, time, as all released single-view experiments set them
 RELEASED_ROPE_RATIOS = (
     3.0,
     3.0,
     1.0,
-)  # height, width, time, as all released single-view experiments set them
+)
 CUT = 3.0  # standard deviations of initial weights
 FLOAT32_KEYS = ("t_embedder.", "t_embedding_norm.", "adaln_modulation")
 

@@ -76,9 +76,8 @@ def opacity_values(opacity: Tensor, first: bool = True) -> Tensor:
     cells = F.avg_pool3d(_checked_opacity(opacity, first), (1, 4, 4))
     b, _, frames, rows, columns = cells.shape
     split = cells.view(b, frames // 4, 4, rows // 2, 2, columns // 2, 2)
-    return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(
-        1, 3
-    )  # (B, frame row column, latents, H / 8, W / 8)
+    # (B, frame row column, latents, H / 8, W / 8)
+    return split.permute(0, 2, 4, 6, 1, 3, 5).flatten(1, 3)
 
 
 def _checked_opacity(opacity: Tensor, first: bool) -> Tensor:

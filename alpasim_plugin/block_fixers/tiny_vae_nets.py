@@ -106,9 +106,8 @@ class CosineTransform(nn.Module):
         space = _cosines(SIDE)
         rows = []
         for (c, t, y, x), _ in COMPONENTS:
-            block = torch.einsum(
-                "t,y,x,c->tyxc", time[t], space[y], space[x], colour[c]
-            )  # (4, 8, 8, 3)
+            # (4, 8, 8, 3)
+            block = torch.einsum("t,y,x,c->tyxc", time[t], space[y], space[x], colour[c])
             cells = block.reshape(GROUP, 2, QUARTER, 2, QUARTER, COLOURS).permute(0, 2, 4, 5, 1, 3)
             rows.append(cells.reshape(GROUP * CELL * COLOURS, 2, 2))
         self.register_buffer(

@@ -163,9 +163,8 @@ class Downsample(nn.Module):
 
     def __init__(self, width: int, time: bool) -> None:
         super().__init__()
-        self.resample = nn.ModuleList(
-            [nn.Identity(), DownsampleConv(width, width)]
-        )  # position 0 is the padding
+        # Position 0 is the padding
+        self.resample = nn.ModuleList([nn.Identity(), DownsampleConv(width, width)])
         self.time_conv = TemporalDownsampleConv(width) if time else None
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
@@ -186,9 +185,8 @@ class Upsample(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, time: bool) -> None:
         super().__init__()
-        self.resample = nn.ModuleList(
-            [nn.Identity(), UpsampleConv(inputs, outputs)]
-        )  # position 0 is the repetition of pixels
+        # Position 0 is the repetition of pixels
+        self.resample = nn.ModuleList([nn.Identity(), UpsampleConv(inputs, outputs)])
         self.time_conv = CausalConv(inputs, 2 * inputs, side=1) if time else None
 
     def next(self, x: Tensor, streaming: StreamingState) -> Tensor:
@@ -202,8 +200,7 @@ class Upsample(nn.Module):
             if following.shape[1]:
                 following = channels_to_frames(self.time_conv.next(following, streaming), 2)
             else:
-                streaming.extend(
-                    following, TAPS - 1
-                )  # only the first latent: cache an empty history, so that the slot exists
+                # Only the first latent: cache an empty history, so that the slot exists
+                streaming.extend(following, TAPS - 1)
             x = torch.cat([alone, following], dim=1)
         return run_layers(self.resample, x, streaming)

@@ -66,7 +66,7 @@ class Lens:
         cover: Its width and height.
         resample: ``(height, w, 2)`` float32 place in the pinhole's image of every pixel; None
             where the lens is that pinhole.
-        seen: ``(height, w)`` which pixels of the lens this pinhole shows; None: all.
+        visible: ``(height, w)`` which pixels of the lens this pinhole shows; None: all.
         weight: ``(height, w)`` float32, share of this pinhole among those that cover the
             lens; None: all of it.
         T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
@@ -79,7 +79,7 @@ class Lens:
     K: F64
     cover: tuple[int, int]
     resample: F32 | None = None
-    seen: Bool | None = None
+    visible: Bool | None = None
     weight: F32 | None = None
     T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
     side: str = ""
@@ -117,18 +117,18 @@ class Rays(NamedTuple):
 
     Attributes:
         ray: ``(H * W, 3)``.
-        seen: ``(H * W,)`` where the lens sees anything.
+        visible: ``(H * W,)`` where the lens sees anything.
         focal: Pixels per radian on the axis, in x and y.
     """
 
     ray: F64
-    seen: Bool
+    visible: Bool
     focal: tuple[float, float]
 
     @property
     def widest_rad(self) -> float:
         """Return the largest angle from the optical axis that is seen."""
-        ray = self.ray[self.seen]
+        ray = self.ray[self.visible]
         return float(np.arctan2(np.linalg.norm(ray[:, :2], axis=1), ray[:, 2]).max())
 
 
@@ -146,7 +146,7 @@ def lens_of(camera: CameraSpec) -> Lens:
             f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
             f"set max_angle to at most {np.rad2deg(WIDEST_RAD):.0f} degrees, or use --upstream",
         )
-    return _covered(camera, rays, rays.seen, "")
+    return _covered(camera, rays, rays.visible, "")
 
 
 def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
@@ -161,12 +161,12 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     rays = rays_of(camera)
     _require_cover(camera, rays)
     if rays.widest_rad <= WIDEST_OF_ONE_RAD:
-        return (_covered(camera, rays, rays.seen, ""),)
+        return (_covered(camera, rays, rays.visible, ""),)
     turns = _panels(rays)
     if rays.widest_rad > WIDEST_OF_PANELS_RAD:
         turns = {side: np.array(axes, dtype=np.float64).T for side, axes in SIDES.items()}
     ahead = np.stack([rays.ray @ turn[:, 2] for turn in turns.values()])
-    behind_most = np.maximum(ahead - ahead.max(axis=0) + BLEND, 0) * rays.seen
+    behind_most = np.maximum(ahead - ahead.max(axis=0) + BLEND, 0) * rays.visible
     weights = behind_most / np.maximum(behind_most.sum(axis=0), 1e-12)
     sides = []
     for (side, turn), weight in zip(turns.items(), weights, strict=True):
@@ -180,7 +180,7 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
             place, share = (
                 np.ascontiguousarray(part[:, first:end]) for part in (whole.resample, share)
             )
-            part = replace(whole, first_column=first, resample=place, seen=None, weight=share)
+            part = replace(whole, first_column=first, resample=place, visible=None, weight=share)
             sides.append(part)
     return tuple(sides)
 
@@ -189,7 +189,7 @@ def _panels(rays: Rays) -> dict[str, F64]:
     """Return by name how three pinholes are turned about the lens's upright axis so that each shows
     a third of its width: their axes as columns.
     """
-    ray = rays.ray[rays.seen]
+    ray = rays.ray[rays.visible]
     azimuth = np.arctan2(ray[:, 0], ray[:, 2])
     low = float(azimuth.min())
     high = float(azimuth.max())
@@ -254,8 +254,8 @@ def joined_image(
     """
     if len(sides) == 1:
         out = sides[0].shown(images[0])
-        if sides[0].seen is not None:
-            out[~sides[0].seen] = outside
+        if sides[0].visible is not None:
+            out[~sides[0].visible] = outside
         return out
     shape = sides[0].height, sides[0].width
     out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
@@ -406,7 +406,7 @@ def check_lens(camera: CameraSpec) -> None:
     rays = rays_of(small)
     lens, K = _checked(small)
     corners = np.array([[x, y] for x in (0, small.width) for y in (0, small.height)]) - K[:2, 2]
-    turns = not bool(rays.seen.all())
+    turns = not bool(rays.visible.all())
     if lens.kind != "opencv":
         scale = K[[0, 1], [0, 1]] if lens.kind == "fisheye" else np.ones(2)
         reach = float(np.linalg.norm(corners / scale, axis=1).max())

@@ -127,8 +127,8 @@ def grip_share(accel_mps2: float, speed_mps: float, steer_rad: float, vehicle: V
     if vehicle.friction is None:
         return 1.0
     lateral = speed_mps**2 * math.tan(steer_rad) / vehicle.wheelbase_m
-    asked = math.hypot(accel_mps2, lateral)
-    return min(1.0, vehicle.friction * G_MPS2 / asked) if asked > 0 else 1.0
+    demand = math.hypot(accel_mps2, lateral)
+    return min(1.0, vehicle.friction * G_MPS2 / demand) if demand > 0 else 1.0
 
 
 def _accel(speed: float, drive: float, brake: float) -> float:

@@ -22,7 +22,9 @@ from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.queries import options_of
 
 HOLD_US = 200_000  # how long the last command stands in for a missing one
-RAMP_MPS3, STOP_MPS2 = 2.0, -3.0  # then the brake grows at this rate up to this deceleration
+# Then the brake grows at this rate up to this deceleration
+RAMP_MPS3 = 2.0
+STOP_MPS2 = -3.0
 INTERFACES = ("virtual", "socketcan", "udp_multicast")
 
 Mark = Literal["fresh", "held", "ramped"]
@@ -133,8 +135,8 @@ class Exchange:
         self._began_us: int | None = None
         self._own_ids = {self.codec.address(sent.message) for sent in self.codec.map.send}
         self._by_id: dict[FrameId, list[_Command]] = {}
-        for one in (self._steer, self._accel):  # one message may carry both
-            self._by_id.setdefault(self.codec.address(one.part.message), []).append(one)
+        for command in (self._steer, self._accel):  # one message may carry both
+            self._by_id.setdefault(self.codec.address(command.part.message), []).append(command)
 
     def step(self, t_us: int, quantities: Mapping[str, float]) -> Commands:
         """Send the messages that are due at an instant and return the commands that answer them.
@@ -200,25 +202,25 @@ class Exchange:
         address = frame.arbitration_id, frame.is_extended_id
         if address in self._own_ids:
             return []  # multicast gives back what was sent
-        mine = self._by_id.get(address, [])
-        if not mine or frame.is_error_frame or frame.is_remote_frame:
+        commands = self._by_id.get(address, [])
+        if not commands or frame.is_error_frame or frame.is_remote_frame:
             self.counts["other"] += 1
             return []
-        return [one for one in mine if self._renew(one, frame, t_us)]
+        return [one for one in commands if self._renew(one, frame, t_us)]
 
-    def _renew(self, one: _Command, frame: can.Message, t_us: int) -> bool:
+    def _renew(self, command: _Command, frame: can.Message, t_us: int) -> bool:
         """Take in a command; return whether the frame renews it."""
         try:
-            value, counter = self.codec.decode(one.part, bytes(frame.data))
+            value, counter = self.codec.decode(command.part, bytes(frame.data))
         except BadFrame as error:
             self.counts[error.fault] += 1
             return False
-        if one.part.counter is not None and counter is not None and one.counter is not None:
-            size = self.codec.counter_size(one.part.message, one.part.counter)
-            ahead = (counter - one.counter) % size
+        if command.part.counter is not None and counter is not None and command.counter is not None:
+            size = self.codec.counter_size(command.part.message, command.part.counter)
+            ahead = (counter - command.counter) % size
             if ahead == 0:
                 self.counts["repeated"] += 1
                 return False
             self.counts["lost"] += ahead - 1
-        one.counter, one.value, one.t_us = counter, value, t_us
+        command.counter, command.value, command.t_us = counter, value, t_us
         return True

@@ -97,16 +97,18 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     shipped = FOLDER / f"{name}.yaml"
     path = shipped if os.path.isfile(shipped) else Path(name)
     if not os.path.isfile(path):
-        known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
-        raise InputError(f"map={name}: no such map or file", f"known: {known}; or name a YAML file")
-    found: CanMap = validate(CanMap, load_yaml(path))
-    database = Path(dbc) if dbc is not None else path.parent / found.dbc
+        map_names = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
+        raise InputError(
+            f"map={name}: no such map or file", f"known: {map_names}; or name a YAML file"
+        )
+    can_map: CanMap = validate(CanMap, load_yaml(path))
+    database = Path(dbc) if dbc is not None else path.parent / can_map.dbc
     if not os.path.isfile(database):
         raise InputError(
             f"database {database}: no such file",
-            f"name it with dbc=FILE; the map {name!r} is for {found.dbc}",
+            f"name it with dbc=FILE; the map {name!r} is for {can_map.dbc}",
         )
-    return found, database
+    return can_map, database
 
 
 class BadFrame(Exception):
@@ -221,7 +223,7 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         ) from error
     codec = Codec(can_map, loaded)
     for part in can_map.parts:
-        where = f"{database}, message {part.message}"
+        location = f"{database}, message {part.message}"
         trial = Codec(codec.map, codec.database)
         try:
             if isinstance(part, Sent):
@@ -232,11 +234,11 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             codec.message(part.message).decode(bytes(frame.data))
         except Exception as refusal:  # the library raises errors of many kinds
             raise InputError(
-                f"{where}: it cannot be sent as the map says: {type(refusal).__name__}: {refusal}",
+                f"{location}: it cannot be sent as the map says: {type(refusal).__name__}: {refusal}",
                 "correct the map, or name a database of the vehicle that the map is for",
             ) from refusal
         if codec.message(part.message).is_multiplexed():
-            raise InputError(f"{where}: it is multiplexed", "name messages of one layout")
+            raise InputError(f"{location}: it is multiplexed", "name messages of one layout")
     return codec
 
 

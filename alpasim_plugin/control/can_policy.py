@@ -149,8 +149,8 @@ class CanPolicy(Policy):
         ego = observation.ego
         if self._predicted is not None and self._predicted[0] == ego.t_us:
             state = self._predicted[1]
-            at = ego.T_world_rig[:2, 3]
-            if np.hypot(state.x_m - at[0], state.y_m - at[1]) < SAME_M:
+            xy = ego.T_world_rig[:2, 3]
+            if np.hypot(state.x_m - xy[0], state.y_m - xy[1]) < SAME_M:
                 return BicycleState(0.0, 0.0, 0.0, state.speed_mps, state.steer_rad)
         self._steer_rate = 0.0
         self._accel = ego.accel_mps2

@@ -50,9 +50,8 @@ PREVIEW_S = np.linspace(0.2, 0.8, 4)
 HOLD_SPEED_MPS = 0.5
 HOLD_MOVE_M = 0.3  # a plan that moves less than this in HOLD_S is a stop
 HOLD_S = 2.0
-_BEFORE = np.tril(
-    np.ones((NODES, NODES)), -1
-)  # d steer at the start of step k / d change in step j
+# Derivative of the steer at the start of step k by the change in step j.
+_BEFORE = np.tril(np.ones((NODES, NODES)), -1)
 _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
 _UP_TO = np.tril(np.ones((NODES, NODES), bool))
 
@@ -295,9 +294,8 @@ class PlanTracker(Controller):
         speed = max(abs(now.speed_mps), MIN_PREVIEW_MPS)
         ds = speed * NODE_S * direction
         target, normal = reference.at(s_now + ds * np.arange(1.0, NODES + 1))
-        weight = (
-            speed**2 / (wheelbase * BANDWIDTH_RADPS**3) / NODE_S
-        )  # sqrt(rho) per change of steer in one node
+        # sqrt(rho) per change of steer in one node
+        weight = speed**2 / (wheelbase * BANDWIDTH_RADPS**3) / NODE_S
         grip = math.atan(MAX_LATERAL_MPS2 * wheelbase / max(now.speed_mps**2, 1e-6))
         limit = min(grip, self.vehicle.max_steer_rad)
         change = np.zeros(NODES)

@@ -183,7 +183,7 @@ def _with_times(
         return photographs, []
     if len(without) < len(photographs):
         raise InputError(
-            f"{without[0].where}: no t_us, which other photographs have",
+            f"{without[0].location}: no t_us, which other photographs have",
             "give every photograph its time, or none",
         )
     columns = []

@@ -140,7 +140,7 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     fast = int(np.argmax(speed))
     if speed[fast] < LEAST_MPS:
         raise InputError(
-            f"{photographs[fast].where}: at most {speed[fast]:.2g} m/s in {dt_s.sum():.4g} s, slower than any car drives",
+            f"{photographs[fast].location}: at most {speed[fast]:.2g} m/s in {dt_s.sum():.4g} s, slower than any car drives",
             "check the unit of the times (t_us: microseconds) and of the poses",
         )
     if speed[fast] > MOST_MPS:
@@ -152,7 +152,7 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
     else:
         return
     raise InputError(
-        f"{photographs[index].where}, {photographs[index].file.name}: {fault}, which no car does",
+        f"{photographs[index].location}, {photographs[index].file.name}: {fault}, which no car does",
         "check the order of the photographs, their times (t_us) and the unit of the poses",
     )
 

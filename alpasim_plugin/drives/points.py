@@ -98,7 +98,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
         & np.isfinite(placement.xyz).all(axis=1)
     )
     begins = np.searchsorted(tracks.point, np.arange(tracks.count))
-    colours = np.array([_colour(views[tracks.view[i]], tracks.at[i]) for i in begins]).reshape(
+    colours = np.array([_colour(views[tracks.view[i]], tracks.pixel[i]) for i in begins]).reshape(
         -1, 3
     )
     R, t, K = pose_arrays(cameras)

@@ -118,7 +118,7 @@ def write_page(
     for use, rows in comparisons.items():
         for i in _spread(len(rows), EXAMPLES):
             name = f"{IMAGES}/{use}-{rows[i].name}.jpg"
-            image = np.concatenate([rows[i].truth, rows[i].shown], axis=0)
+            image = np.concatenate([rows[i].truth, rows[i].image], axis=0)
             data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
             write_bytes(folder / name, data)
             examples.append((use, rows[i], name))

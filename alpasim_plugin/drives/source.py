@@ -143,7 +143,7 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
         first = drive.of(str(photograph.camera))[0].lens
         if size != (first.width, first.height):
             raise InputError(
-                f"{photograph.where}, {photograph.file}: {size} pixels, others of the camera {photograph.camera!r} have {first.width}x{first.height}",
+                f"{photograph.location}, {photograph.file}: {size} pixels, others of the camera {photograph.camera!r} have {first.width}x{first.height}",
                 "give the photographs as they were, each with its camera's name",
             )
     steps = np.linalg.norm(np.diff(drive.path, axis=0), axis=1)
@@ -183,7 +183,7 @@ def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> Source
 
 def _two_units(photograph: PosedPhotograph, fault: str) -> InputError:
     return InputError(
-        f"{photograph.where}, {photograph.file.name}: {fault}",
+        f"{photograph.location}, {photograph.file.name}: {fault}",
         "give all poses in one unit, metres, and one drive at a time",
     )
 
@@ -211,7 +211,7 @@ def timed(cameras: Sequence[Sequence[PosedPhotograph]]) -> list[PosedPhotograph]
         counts = [len(camera) for camera in cameras]
         if len(set(counts)) > 1:
             raise InputError(
-                f"{cameras[0][0].where}: no times, and cameras of {counts} photographs whose names share no numbers",
+                f"{cameras[0][0].location}: no times, and cameras of {counts} photographs whose names share no numbers",
                 "give each photograph its time (t_us), or photographs of one time names of one number",
             )
         numbers = [list(range(count)) for count in counts]

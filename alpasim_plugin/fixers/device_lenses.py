@@ -72,6 +72,6 @@ def _uploaded(side: Lens, device: torch.device) -> tuple[Tensor, Tensor]:
     weight = np.ones(place.shape[:2], np.float32)
     if side.weight is not None:
         weight = side.weight
-    elif side.seen is not None:
-        weight = side.seen.astype(np.float32)
+    elif side.visible is not None:
+        weight = side.visible.astype(np.float32)
     return upload(place[None], device), upload(weight[..., None], device)

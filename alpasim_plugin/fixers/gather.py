@@ -182,7 +182,7 @@ def _blend(
     """
     count, height, width = references.shape
     cells_down, cells_across = weight.shape[1:3]
-    one = np.float32(1.0)
+    unit = np.float32(1.0)
     zero = np.float32(0.0)
     largest = np.float32(LARGEST)
     nowhere = np.float32(NOWHERE)
@@ -208,7 +208,7 @@ def _blend(
     row_of[:] = -1
     for i in range(len(repaired)):
         y = first_row + i
-        total[:] = one
+        total[:] = unit
         for x in range(width):
             for c in range(3):
                 blended[c, x] = repaired[i, x, c]
@@ -234,14 +234,14 @@ def _blend(
             for x in range(width):
                 logarithm = upper[3, x] + fy[y] * (lower[3, x] - upper[3, x])
                 logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
-                share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), one)
+                share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), unit)
                 total[x] += share[x]
             _add_row(upper, lower, fy[y], looked_up, share, blended)
         for x in range(width):
-            over = one / total[x]
+            over = unit / total[x]
             for c in range(3):
                 out[i, x, c] = blended[c, x] * over
-            recorded[i, x, 0] = max(one - over, zero)
+            recorded[i, x, 0] = max(unit - over, zero)
 
 
 @vector_kernel

@@ -34,11 +34,14 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads
 
 I32 = npt.NDArray[np.int32]
 
-NEAREST_M, FARTHEST_M = 0.5, 120.0  # depths in which the road is taken for the plane below the rig
+# Depths in which the road is taken for the plane below the rig
+NEAREST_M = 0.5
+FARTHEST_M = 120.0
 WINDOW_RAD = 0.075  # side of the window in which two recorded frames are compared
 # Grey levels by which the ground may agree less than the render's depth does; and where the render
 # itself shows a surface about as far away, which is the ground at a wrong depth.
-PREFERENCE, NEAR_PREFERENCE = 3, 10
+PREFERENCE = 3
+NEAR_PREFERENCE = 10
 ABOUT = (0.75, 1.4)  # the render's depth as a share of the ground's
 FLOATING_M = 1.0  # nothing stands so near to a camera: it does not hide the ground
 GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
@@ -128,7 +131,7 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     height_m = T_world_rig[:3, 2] @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3])
     out = np.empty(target.depth.shape, np.float32)
     _ground(np.ascontiguousarray(target.depth), down, height_m, out)
-    out[on_boxes(target.depth.shape, target.placed.seen)] = 0
+    out[on_boxes(target.depth.shape, target.placed.boxes)] = 0
     return out
 
 
@@ -150,7 +153,7 @@ def with_users(recorded: RecordedImage, boxes: Mapping[str, Box]) -> RecordedIma
     placed = place_boxes(
         (height, width), recorded.K, recorded.T_world_camera, recorded.actors, boxes
     )
-    users = on_boxes((height, width), placed.seen)
+    users = on_boxes((height, width), placed.boxes)
     return replace(recorded, users=users) if users.any() else recorded
 
 

@@ -139,14 +139,14 @@ class BlockRunner:
         maps = [item.map for item in block if item.map is not None]
         name = f"{type(fixer).__name__}, {len(frames)} frames of {frames[0].t_us} to {frames[-1].t_us} us"
         kind = FixerError if is_own(fixer) else FixerFault
-        where = defined(fixer, "step")
-        shown = frames if is_own(fixer) else [read_only(frame) for frame in frames]
-        with self._timed("fix"), blaming(kind, name, where, not is_own(fixer)):
-            fixed = list(call(shown, maps))
+        definition = defined(fixer, "step")
+        inputs = frames if is_own(fixer) else [read_only(frame) for frame in frames]
+        with self._timed("fix"), blaming(kind, name, definition, not is_own(fixer)):
+            fixed = list(call(inputs, maps))
             problem = _problem(frames, fixed)
         if problem:
             raise kind(
-                f"{name}: {problem}{where}",
+                f"{name}: {problem}{definition}",
                 "fix the fixer: as many frames out as in, with the same times, cameras and sizes",
             )
         out = []

@@ -43,10 +43,8 @@ from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
 KEPT_FRAMES = 24
 KEPT_INSTANTS = 4
-SECOND_M, TURN_M = (
-    0.5,
-    10.0,
-)  # a second apart counts as so many metres, and so does a view that is turned by a radian
+SECOND_M = 0.5  # as so many metres counts a second apart
+TURN_M = 10.0  # as so many metres counts a view that is turned by a radian
 FARTHEST_M = 25.0  # a recorded frame from farther away is no reference
 # the distance of a frame that the last image had counts as this share of it, so that references
 # do not flicker
@@ -130,7 +128,7 @@ class Window(NamedTuple):
 
     band: Band
     target: WarpTarget
-    own: tuple[slice, slice]
+    inner: tuple[slice, slice]
 
 
 class ReferenceSession:
@@ -184,10 +182,10 @@ class ReferenceSession:
             frames: The renders, whose depth carries the recorded frames into their views.
             on_device: Whether those of frames that a device drew may stay there.
         """
-        drawn = planes_of(frames) if on_device else []
-        stays = len(drawn) == len(frames)
+        device_planes = planes_of(frames) if on_device else []
+        stays = len(device_planes) == len(frames)
         chosen = [self._choose(request) for request in requests]
-        recorded = self._recorded_images([i for mine, _ in chosen for i in mine])
+        recorded = self._recorded_images([i for indices, _ in chosen for i in indices])
         images: Mapping[int, Any] = recorded
         if stays:
             import torch
@@ -196,26 +194,27 @@ class ReferenceSession:
 
             images = self._uploaded
             for i in recorded.keys() - images.keys():
-                self._uploaded[i] = upload_image(recorded[i], drawn[0].rgb.device)
+                self._uploaded[i] = upload_image(recorded[i], device_planes[0].rgb.device)
         views = [
-            (request, self._whole_lenses(mine, images), T_world_rig)
-            for request, (mine, T_world_rig) in zip(requests, chosen, strict=True)
+            (request, self._whole_lenses(indices, images), T_world_rig)
+            for request, (indices, T_world_rig) in zip(requests, chosen, strict=True)
         ]
         carry_all = _carry_on_device if stays else self._carry_on_host
-        carried = self._carried(views, drawn if stays else frames, carry_all)
+        carried = self._carried(views, device_planes if stays else frames, carry_all)
         if not stays:
             return [
-                frame.changed(references=mine) for frame, mine in zip(frames, carried, strict=True)
+                frame.changed(references=references)
+                for frame, references in zip(frames, carried, strict=True)
             ]
 
         def with_references(index: int) -> Frame:
             def references(planes: DevicePlanes) -> Mapping[str, Any]:
-                mine = carried[index]
-                if planes is not drawn[index]:  # drawn again
-                    (mine,) = self._carried([views[index]], [planes], carry_all)
-                return {"references": torch.stack(list(mine)) if mine else None}
+                images = carried[index]
+                if planes is not device_planes[index]:  # drawn again
+                    (images,) = self._carried([views[index]], [planes], carry_all)
+                return {"references": torch.stack(list(images)) if images else None}
 
-            return frames[index].changed(on_device=drawn[index].changed(references))
+            return frames[index].changed(on_device=device_planes[index].changed(references))
 
         return [with_references(index) for index in range(len(frames))]
 
@@ -235,12 +234,12 @@ class ReferenceSession:
         return windows
 
     def _carried(
-        self, views: Sequence[View], shown: Sequence[Any], carry_all: Callable[[Any], Any]
+        self, views: Sequence[View], renders: Sequence[Any], carry_all: Callable[[Any], Any]
     ) -> list[tuple[Any, ...]]:
         """Return the recorded frames in each view ``(H, W, 4)``; none without depth."""
         cuts = [
-            self._windows(request, one.depth) if images and one.depth is not None else []
-            for (request, images, _), one in zip(views, shown, strict=True)
+            self._windows(request, render.depth) if images and render.depth is not None else []
+            for (request, images, _), render in zip(views, renders, strict=True)
         ]
         placed = [
             (images, window.target, T_world_rig)
@@ -309,7 +308,7 @@ def _whole(
 ) -> tuple[Any, ...]:
     """Return each recorded frame in a view, of those in its windows."""
     views = [
-        [image[window.own] for image in part] for window, part in zip(windows, parts, strict=True)
+        [image[window.inner] for image in part] for window, part in zip(windows, parts, strict=True)
     ]
     exposed = [window.band for window in windows]
     return tuple(joined(request, exposed, images) for images in zip(*views, strict=True))

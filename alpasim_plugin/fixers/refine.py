@@ -23,7 +23,7 @@ class FixedBlock:
     something was.
     """
 
-    given: tuple[Frame, ...]
+    frames: tuple[Frame, ...]
     fixed: tuple[Frame, ...]
     seconds: float
     refused_psnr_db: float | None = None
@@ -64,22 +64,22 @@ def refine_frames(
     index = 0
     is_unlike = False
     while pairs := list(islice(stream, fixer.blocks.frames(index))):
-        given = tuple(frame for frame, _ in pairs)
+        rendered = tuple(frame for frame, _ in pairs)
         maps = tuple(image for _, image in pairs if image is not None)
         begin = time.perf_counter()
-        fixed = given if is_unlike else tuple(fixer.step(given, maps))
+        fixed = rendered if is_unlike else tuple(fixer.step(rendered, maps))
         took_s = time.perf_counter() - begin
         refused_psnr_db = None
         if limit is not None and not is_unlike:
-            worst = min(_psnr_db(*pair) for pair in zip(given, fixed, strict=True))
+            worst = min(_psnr_db(*pair) for pair in zip(rendered, fixed, strict=True))
             is_unlike = worst < limit.least_psnr_db
             refused_psnr_db = worst if is_unlike else None
         fixed = (
-            tuple(replace(frame, events=(*frame.events, UNLIKE)) for frame in given)
+            tuple(replace(frame, events=(*frame.events, UNLIKE)) for frame in rendered)
             if is_unlike
             else fixed
         )
-        yield FixedBlock(given, fixed, took_s, refused_psnr_db)
+        yield FixedBlock(rendered, fixed, took_s, refused_psnr_db)
         index += 1
 
 
@@ -138,11 +138,11 @@ class StreamStats:
 
     def add(self, block: FixedBlock) -> None:
         """Add one block."""
-        self.frames += len(block.given)
+        self.frames += len(block.frames)
         self.refused_psnr_db = (
             block.refused_psnr_db if self.refused_psnr_db is None else self.refused_psnr_db
         )
-        self.ms_per_frame.append(block.seconds * 1e3 / len(block.given))
-        for given, fixed in zip(block.given, block.fixed, strict=True):
-            self.difference.add(given.rgb, fixed.rgb)
+        self.ms_per_frame.append(block.seconds * 1e3 / len(block.frames))
+        for frame, fixed in zip(block.frames, block.fixed, strict=True):
+            self.difference.add(frame.rgb, fixed.rgb)
             self.events.update(fixed.events)

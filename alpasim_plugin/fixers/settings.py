@@ -188,9 +188,8 @@ def counted_steps(value: Any) -> Any:
     """Take a count of steps for the schedule's own, as ``NAME@STEPS`` gives it."""
     if isinstance(value, int) and not isinstance(value, bool):
         return schedule.names(value)
-    return (
-        tuple(value) if isinstance(value, list) else value
-    )  # strict validation takes no list for a tuple after this step
+    # Strict validation takes no list for a tuple after this step
+    return tuple(value) if isinstance(value, list) else value
 
 
 def check_steps(steps: tuple[float, ...]) -> None:

@@ -11,7 +11,8 @@ from alpasim_plugin.core.types import F32, GUESSED_SHARE, RECORDED_SHARE, TRUST_
 
 # a pixel that differs from the render by so much, of a range of 2, is the fixer's own altogether
 MADE_UP = 0.25
-CELL_PX, MOST_COLUMNS = 16, 32  # side of a cell; an image wider than 512 pixels has larger ones
+CELL_PX = 16  # side of a cell
+MOST_COLUMNS = 32  # an image wider than 512 pixels has larger ones
 LEVELS = 15  # a share is a hexadecimal digit
 
 

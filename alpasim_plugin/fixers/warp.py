@@ -164,7 +164,7 @@ class PlacedBoxes(NamedTuple):
     """The A actors that have a box, as a camera sees them."""
 
     names: list[str]
-    seen: SeenBoxes
+    boxes: SeenBoxes
 
 
 def place_boxes(
@@ -185,15 +185,13 @@ def place_boxes(
         [np.negative(AROUND_M), AROUND_M]
     )
     walls[..., 0, 2] = SOLE_M - sizes[..., 2] / 2
-    corners = walls[
-        :, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]
-    ]  # (A, 8, 3)
+    # (A, 8, 3)
+    corners = walls[:, [[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]
     project = K @ inverse(T_box_camera)[:, :3]
     projected = corners @ np.swapaxes(project[..., :3], 1, 2) + project[:, None, :, 3]
     behind = (projected[..., 2] <= 0).all(axis=1, keepdims=True)
-    around = (projected[..., 2] <= NEAREST_M).any(
-        axis=1, keepdims=True
-    )  # some corners lie behind the camera, and the box may reach anywhere
+    # Some corners lie behind the camera, and the box may reach anywhere
+    around = (projected[..., 2] <= NEAREST_M).any(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         u_v = projected[..., :2] / projected[..., 2:]
     whole = np.array(shape[::-1])

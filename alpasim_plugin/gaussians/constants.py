@@ -31,7 +31,9 @@ CAM_WIDTH = 8
 CAM_HEIGHT = 9
 # of a rolling shutter: the time of a pixel, in shutters from its middle, as a U + b V + c; and by how
 # many pixels things move while it is open, 0: it does not roll
-CAM_TIME_U, CAM_TIME_V, CAM_TIME_0 = 10, 11, 12
+CAM_TIME_U = 10
+CAM_TIME_V = 11
+CAM_TIME_0 = 12
 CAM_REACH = 13
 
 # A node's pose, one float64 array: rotation node to camera, camera centre in the node, the 2D filter
@@ -61,6 +63,5 @@ BLOCK_REACH = 15
 RECORD = 16  # columns 12 to 14 are empty
 
 TILE = 16  # pixels; a tile is 4 x 4 blocks of 4 x 4 pixels
-EXPONENT_SCALE = math.sqrt(
-    math.log2(math.e) / 16.0
-)  # turns (q^2 / 2) log2(e) / 8 into a plain sum of squares
+# Turns (q^2 / 2) log2(e) / 8 into a plain sum of squares
+EXPONENT_SCALE = math.sqrt(math.log2(math.e) / 16.0)

@@ -39,12 +39,15 @@ from alpasim_plugin.runs.rollout import Loop
 from alpasim_plugin.runs.scoring import score_log
 from scenarios.load import load_scenario
 
-PREDICTED_US, PREDICTED_STEP_US = (
-    2_000_000,
-    100_000,
-)  # of the plan that stands in the log for a held command
-FORWARD_M, BACKWARD_M, LATERAL_M = 200.0, 50.0, 100.0  # bounds of a trajectory, rig frame
-ROUTE_POINTS, ROUTE_M = 20, 200.0  # rows of the route, and the bound of its coordinates
+# Of the plan that stands in the log for a held command
+PREDICTED_US = 2_000_000
+PREDICTED_STEP_US = 100_000
+# Bounds of a trajectory, rig frame
+FORWARD_M = 200.0
+BACKWARD_M = 50.0
+LATERAL_M = 100.0
+ROUTE_POINTS = 20  # rows of the route
+ROUTE_M = 200.0  # bound of its coordinates
 SPEED_MPS = 100.0
 ROLLOUT_SEEDS = 2**31
 
@@ -187,11 +190,11 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._renderer = renderer
         self.render_mode = render_mode
         self._scenario = self._scenarios[0]
-        known = [one.name for one in self._scenario.cameras]
-        name = camera if camera is not None else known[0] if known else ""
-        if name and name not in known:
+        names = [one.name for one in self._scenario.cameras]
+        name = camera if camera is not None else names[0] if names else ""
+        if name and name not in names:
             raise InputError(
-                f"camera {name!r}: the scenario has {known}",
+                f"camera {name!r}: the scenario has {names}",
                 "name one of them, or camera='' for none",
             )
         self._sensors = (SensorSpec(name),) if name else ()
@@ -339,14 +342,14 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
     def _seen(self) -> dict[str, Any]:
         observation = self.observation
         speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
-        known = np.isfinite(observation.route_rig).all(axis=1)
+        finite = np.isfinite(observation.route_rig).all(axis=1)
         out = np.zeros((ROUTE_POINTS, 3), np.float32)
-        out[known, :2] = np.clip(observation.route_rig[known, :2], -ROUTE_M, ROUTE_M)
-        out[known, 2] = 1.0
-        seen = {"speed": speed.astype(np.float32), "route": out}
+        out[finite, :2] = np.clip(observation.route_rig[finite, :2], -ROUTE_M, ROUTE_M)
+        out[finite, 2] = 1.0
+        values = {"speed": speed.astype(np.float32), "route": out}
         if self._camera is not None:
-            seen["camera"] = np.array(observation.frames[self._camera.name].rgb)
-        return seen
+            values["camera"] = np.array(observation.frames[self._camera.name].rgb)
+        return values
 
 
 class _Watching(Recorder):

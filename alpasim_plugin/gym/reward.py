@@ -73,18 +73,18 @@ class Scorer:
         rollout = self._as_log(window)
         check_rollout(rollout)
         scene = self._scenario.scene
-        found = {
-            one.name: one
+        metrics = {
+            metric.name: metric
             for name, evaluator in self._evaluators
-            for one in run_evaluator(name, evaluator, rollout, scene)
+            for metric in run_evaluator(name, evaluator, rollout, scene)
         }
         is_first = self._before is None
         self._before = instants[-1]
-        lateral_m = float(self._value(found["lateral_distance_m"])[-1])
-        share = self._value(found["progress"])
-        length_m = self._value(found["gt_dist_traveled_m"])
+        lateral_m = float(self._value(metrics["lateral_distance_m"])[-1])
+        share = self._value(metrics["progress"])
+        length_m = self._value(metrics["gt_dist_traveled_m"])
         collision, offroad = (
-            bool((self._value(found[name])[0 if is_first else 1 :] > 0.5).any())
+            bool((self._value(metrics[name])[0 if is_first else 1 :] > 0.5).any())
             for name in ("collision_any", "offroad")
         )
         gained_m = 0.0 if is_first else float((share[-1] - share[0]) * length_m[-1])
@@ -115,9 +115,9 @@ class Scorer:
         )
         actors = {}
         for actor_id in dict.fromkeys(name for _, others in window for name in others):
-            there = [i for i, (_, others) in enumerate(window) if actor_id in others]
+            steps = [i for i, (_, others) in enumerate(window) if actor_id in others]
             track = trajectory_from_poses(
-                times[there], np.array([window[i][1][actor_id] for i in there])
+                times[steps], np.array([window[i][1][actor_id] for i in steps])
             )
             kind = self._kinds[actor_id]
             actors[actor_id] = Actor(actor_id, kind.label, kind.box, track, kind.is_static)

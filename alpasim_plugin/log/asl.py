@@ -87,9 +87,9 @@ class AslReader:
         self.truncated = f"{self.path}: last entry cut at byte {offset}; {index} whole entries read"
         return None
 
-    def _damaged(self, index: int, offset: int, found: str) -> InputError:
+    def _damaged(self, index: int, offset: int, problem: str) -> InputError:
         return InputError(
-            f"{self.path}, entry {index} at byte {offset}: {found}",
+            f"{self.path}, entry {index} at byte {offset}: {problem}",
             _COPY_AGAIN,
         )
 

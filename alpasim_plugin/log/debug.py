@@ -35,9 +35,9 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
         kind = kind_of(name, value)
         array: Any = np.asarray(value) if kind != "text" else None
         if kind == "text":
-            shown: list[Any] = [_words(value)]
+            cells: list[Any] = [_words(value)]
         elif kind == "images":
-            shown = [base64.b64encode(encode_image(smaller(array, WIDTH_PX), "jpeg", 76)).decode()]
+            cells = [base64.b64encode(encode_image(smaller(array, WIDTH_PX), "jpeg", 76)).decode()]
         elif kind == "heat":
             ends = [f"{value:.3g}" for value in (np.nanmin(array), np.nanmax(array))]
             # Yellow where values are high, clear where they are low or missing.
@@ -48,14 +48,16 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
             bgra = np.stack(
                 [np.full_like(share, 40), 60 + 170 * share, 0 * share + 250, 200 * share], axis=2
             )
-            shown = [
+            cells = [
                 base64.b64encode(cv2.imencode(".png", bgra.astype(np.uint8))[1].tobytes()).decode(),
                 *ends,
             ]
         else:
-            known = array[np.isfinite(array).all(axis=1)]
-            shown = [known[:, : 4 if kind == "boxes" else 2].astype(np.float64).round(3).tolist()]
-        row[kind].append([str(name), *shown])
+            whole_rows = array[np.isfinite(array).all(axis=1)]
+            cells = [
+                whole_rows[:, : 4 if kind == "boxes" else 2].astype(np.float64).round(3).tolist()
+            ]
+        row[kind].append([str(name), *cells])
     return row
 
 

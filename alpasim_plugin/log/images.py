@@ -50,14 +50,14 @@ def encode_image(rgb: U8, encoding: ImageEncoding = "png", quality: int = 95) ->
     return data.tobytes()
 
 
-def decode_image(data: bytes, what: str = "a camera image") -> U8:
+def decode_image(data: bytes, name: str = "a camera image") -> U8:
     """Decode PNG or JPEG to ``(H, W, 3)`` uint8 sRGB. The size is the image's own, never the
     requested one.
 
     Raises:
         InputError: Not a whole image.
     """
-    bgr = images.decode_image(data, what, "store PNG or JPEG images in the log")
+    bgr = images.decode_image(data, name, "store PNG or JPEG images in the log")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 

@@ -135,16 +135,16 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> Non
     if not message.trajectory.poses:
         got.info["empty_plans"] += 1
         return
-    what = f"{got.path}, plan at {request.time_now_us} us"
+    location = f"{got.path}, plan at {request.time_now_us} us"
     samples = tuple(
-        read_trajectory(sample, f"{what}, sample {i}")
+        read_trajectory(sample, f"{location}, sample {i}")
         for i, sample in enumerate(message.debug_info.sampled_trajectories)
     )
     got.plans.append(
         LoggedPlan(
             request.time_now_us,
             request.time_query_us,
-            read_trajectory(message.trajectory, what),
+            read_trajectory(message.trajectory, location),
             samples,
             np.array([[p.x, p.y] for p in got.route.waypoints]).reshape(-1, 2),
         )
@@ -222,9 +222,9 @@ def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
     )
 
 
-def _track(poses: list[tuple[int, common_pb2.Pose]], what: str) -> Trajectory:
-    t_us = increasing_times([t for t, _ in poses], what)
-    xyz, quat = read_poses((pose for _, pose in poses), what)
+def _track(poses: list[tuple[int, common_pb2.Pose]], location: str) -> Trajectory:
+    t_us = increasing_times([t for t, _ in poses], location)
+    xyz, quat = read_poses((pose for _, pose in poses), location)
     return Trajectory(t_us, xyz, quat)
 
 
@@ -243,5 +243,5 @@ def _box(aabb: common_pb2.AABB, path: Path, actor: str) -> Box:
     return box
 
 
-def _bad(path: Path, found: str, do_this: str) -> InputError:
-    return InputError(f"{path}: {found}", do_this)
+def _bad(path: Path, problem: str, do_this: str) -> InputError:
+    return InputError(f"{path}: {problem}", do_this)

@@ -112,13 +112,13 @@ def T_rig_box(vehicle: Vehicle) -> F64:
 # --- to the wire
 
 
-def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
+def wire_poses(xyz: F64, quat: F64, name: str) -> list[common_pb2.Pose]:
     """Return one message a pose.
 
     Args:
         xyz: ``(N, 3)`` metres.
         quat: ``(N, 4)`` wxyz; normalised here.
-        what: Whose poses, for the error.
+        name: Whose poses, for the error.
 
     Raises:
         InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for
@@ -129,7 +129,7 @@ def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
     if not (near.all() and long.all()):
         i = int(np.argmin(near.all(axis=-1) & long[:, 0]))
         raise InputError(
-            f"{what}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
+            f"{name}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
     vec = common_pb2.Vec3
@@ -140,14 +140,14 @@ def wire_poses(xyz: F64, quat: F64, what: str) -> list[common_pb2.Pose]:
     ]
 
 
-def wire_pose(transform: F64, what: str) -> common_pb2.Pose:
+def wire_pose(transform: F64, name: str) -> common_pb2.Pose:
     """Return the message of one ``(4, 4)`` transform; see `wire_poses`."""
-    return wire_poses(transform[None, :3, 3], quat_from_matrix(transform[None, :3, :3]), what)[0]
+    return wire_poses(transform[None, :3, 3], quat_from_matrix(transform[None, :3, :3]), name)[0]
 
 
-def wire_trajectory(trajectory: Trajectory, what: str) -> common_pb2.Trajectory:
+def wire_trajectory(trajectory: Trajectory, name: str) -> common_pb2.Trajectory:
     """Return the message of a trajectory; see `wire_poses`."""
-    poses = wire_poses(trajectory.xyz, trajectory.quat, what)
+    poses = wire_poses(trajectory.xyz, trajectory.quat, name)
     at_time = common_pb2.PoseAtTime
     return common_pb2.Trajectory(
         poses=[
@@ -246,14 +246,14 @@ def wire_render_request(
     if request.actors:
         ids = sorted(request.actors)
         first = request.actors if request.exposure is None else request.exposure.actors_start
-        both = [
+        start_and_end = [
             wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
             for stack in (np.stack([at[i] for i in ids]) for at in (first, request.actors))
         ]
         pair = sensorsim_pb2.PosePair
         objects = [
             sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=q))
-            for i, p, q in zip(ids, *both, strict=True)
+            for i, p, q in zip(ids, *start_and_end, strict=True)
         ]
     return sensorsim_pb2.RGBRenderRequest(
         scene_id=scene_id,
@@ -313,7 +313,7 @@ def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionReq
 # --- from the wire
 
 
-def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
+def read_poses(poses: Iterable[common_pb2.Pose], name: str) -> tuple[F64, F64]:
     """Return positions ``(N, 3)`` and unit quaternions ``(N, 4)``, widened to float64.
 
     Raises:
@@ -330,24 +330,24 @@ def read_poses(poses: Iterable[common_pb2.Pose], what: str) -> tuple[F64, F64]:
     if bad.any():
         i = int(np.argmax(bad))
         raise InputError(
-            f"{what}: pose {i}: position {xyz[i].tolist()}, quaternion {quat[i].tolist()} with |q|^2 = {square[i]:.6g}",
+            f"{name}: pose {i}: position {xyz[i].tolist()}, quaternion {quat[i].tolist()} with |q|^2 = {square[i]:.6g}",
             "write the log again with finite positions and unit quaternions (w = 1 where there is no rotation)",
         )
     return xyz, quat / np.sqrt(square)[:, None]
 
 
-def read_trajectory(message: common_pb2.Trajectory, what: str) -> Trajectory:
+def read_trajectory(message: common_pb2.Trajectory, name: str) -> Trajectory:
     """Return a trajectory.
 
     Raises:
         InputError: Times do not increase strictly, or a pose is bad (see `read_poses`).
     """
-    t_us = increasing_times([p.timestamp_us for p in message.poses], what)
-    xyz, quat = read_poses((p.pose for p in message.poses), what)
+    t_us = increasing_times([p.timestamp_us for p in message.poses], name)
+    xyz, quat = read_poses((p.pose for p in message.poses), name)
     return Trajectory(t_us, xyz, quat)
 
 
-def increasing_times(times: Sequence[int], what: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def increasing_times(times: Sequence[int], name: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """Return times ``(N,)`` int64.
 
     Raises:
@@ -358,15 +358,15 @@ def increasing_times(times: Sequence[int], what: str) -> np.ndarray[tuple[int], 
     if len(late):
         i = int(late[0])
         raise InputError(
-            f"{what}: time {times[i]} us at index {i} after {times[i - 1]} us",
+            f"{name}: time {times[i]} us at index {i} after {times[i - 1]} us",
             "write the log again with strictly increasing times in microseconds",
         )
     return t_us.astype(np.int64)
 
 
-def read_transform(pose: common_pb2.Pose, what: str) -> F64:
+def read_transform(pose: common_pb2.Pose, name: str) -> F64:
     """Return the ``(4, 4)`` transform of one pose; see `read_poses`."""
-    xyz, quat = read_poses([pose], what)
+    xyz, quat = read_poses([pose], name)
     return se3(xyz[0], quat[0])
 
 

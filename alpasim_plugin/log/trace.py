@@ -103,7 +103,7 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]]) -> Trace:
 
 
 def first_difference(
-    one: Trace,
+    trace: Trace,
     other: Trace,
     start_us: int,
     control_us: int,
@@ -115,7 +115,7 @@ def first_difference(
     loop makes first is named.
 
     Args:
-        one: A rollout.
+        trace: A rollout.
         other: Another one.
         start_us: Time of the first frame, from which steps are counted.
         control_us: Length of a step.
@@ -125,11 +125,11 @@ def first_difference(
         ``component``, ``t_us``, ``step`` (None before the first frame) and ``what``.
     """
     differences = []
-    for key in one | other:
+    for key in trace | other:
         t_us, component, part = key
         is_compared = until_us is None or t_us < until_us[component]
-        if is_compared and one.get(key) != other.get(key):
-            text = part if key in one and key in other else f"{part}, in one only"
+        if is_compared and trace.get(key) != other.get(key):
+            text = part if key in trace and key in other else f"{part}, in one only"
             differences.append((t_us, COMPONENTS.index(component), text))
     if not differences:
         return None

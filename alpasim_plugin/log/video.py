@@ -21,7 +21,10 @@ from alpasim_plugin.core.types import I64, U8
 UNSPECIFIED = 2  # of ITU-T H.273: matrix, primaries and transfer that a video does not state
 GIVE = "give a whole video file (MP4, MOV, MKV, WebM, AVI, ...)"
 SQUARE = 1e-3  # by how much a turn may miss a quarter
-BT601, BT709 = 5, 1  # matrices of ITU-T H.273
+# Matrices of ITU-T H.273
+BT601 = 5
+BT709 = 1
+# Stated matrix -> the one to convert with
 WRITABLE = {
     UNSPECIFIED: BT601,
     BT709: BT709,
@@ -30,7 +33,7 @@ WRITABLE = {
     6: BT601,
     7: 7,
     9: 9,
-}  # stated matrix -> the one to convert with
+}
 _MAX_DENOMINATOR = 1001  # covers whole rates and the 1001 family (29.97 = 30000/1001)
 
 
@@ -146,15 +149,15 @@ class VideoReader:
         for index, frame in enumerate(itertools.chain([self._first], self._decoded)):
             time = frame.pts if frame.pts is not None else 0 if last is None else last + step
             if last is not None and time <= last:
-                found = f"frame {index} at {float(time * self.format.time_base):.6f} s, not after the one before"
+                problem = f"frame {index} at {float(time * self.format.time_base):.6f} s, not after the one before"
                 raise self._refusal(
-                    found,
+                    problem,
                     "rewrite its time stamps, for example with ffmpeg -i IN -vf setpts=N/FR/TB OUT",
                 )
             image = self._upright(frame)
             if image.shape[:2] != (self.format.height, self.format.width):
-                found = f"frame {index} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
-                raise self._refusal(found, "cut it where the size changes")
+                problem = f"frame {index} is {image.shape[1]}x{image.shape[0]}, the first is {self.format.width}x{self.format.height}"
+                raise self._refusal(problem, "cut it where the size changes")
             yield TimedFrame(image, time, frame.duration or step)
             last = time
         # A file that was cut short: fewer frames than it claims, and an end well before that.
@@ -232,8 +235,8 @@ class VideoReader:
             image, a, d = image.swapaxes(0, 1), c, b
         return image[:: int(d), :: int(a)]
 
-    def _refusal(self, found: str, do: str = GIVE) -> InputError:
-        return InputError(f"{self.path}: {found}", do)
+    def _refusal(self, problem: str, do: str = GIVE) -> InputError:
+        return InputError(f"{self.path}: {problem}", do)
 
 
 class VideoWriter:

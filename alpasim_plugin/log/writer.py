@@ -204,7 +204,8 @@ class AslWriter:
             samples: Alternatives it considered, the same way; they feed minADE.
         """
         first, *others = (
-            wire_trajectory(one, "the driver's plan and its samples") for one in (plan, *samples)
+            wire_trajectory(trajectory, "the driver's plan and its samples")
+            for trajectory in (plan, *samples)
         )
         message = egodriver_pb2.DriveResponse
         self._write(
@@ -312,8 +313,10 @@ class AslWriter:
         )
 
     def _version(self, service: str) -> common_pb2.VersionId:
-        given = self.header.versions.get(service, __version__ if service == "runtime" else "<skip>")
-        git_hash = "<skip>" if given == "<skip>" else ""
+        version = self.header.versions.get(
+            service, __version__ if service == "runtime" else "<skip>"
+        )
+        git_hash = "<skip>" if version == "<skip>" else ""
         return common_pb2.VersionId(
-            version_id=given, git_hash=git_hash, grpc_api_version=api_version()
+            version_id=version, git_hash=git_hash, grpc_api_version=api_version()
         )

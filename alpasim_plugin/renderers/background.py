@@ -16,7 +16,9 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.files import read_gaussians
 
 # A Gaussian is near a point of the path: in plan view, and in height.
-NEAR_M, BELOW_M, ABOVE_M = 10.0, 5.0, 15.0
+NEAR_M = 10.0
+BELOW_M = 5.0
+ABOVE_M = 15.0
 FEWEST = 20  # Gaussians near a point of the path for it to count as covered
 STEP_M = 2.0
 VISIBLE = 0.05  # opacity

@@ -10,10 +10,12 @@ from alpasim_plugin.streets.site import path_of
 from alpasim_plugin.world.ground import height_at
 
 # Along the optical axis: nearer is the ego's own place, farther is thinner than a pixel.
-NEAREST_M, FARTHEST_M = 3.0, 40.0
+NEAREST_M = 3.0
+FARTHEST_M = 40.0
 # So many points judge a view, the nearest, which a road user ahead does not hide; this share of them
 # must show a surface.
-JUDGES, LEAST_SHARE = 8, 0.25
+JUDGES = 8
+LEAST_SHARE = 0.25
 ABOVE_M = 0.3  # of a camera over the road: from below, or in it, nothing of it is seen
 
 

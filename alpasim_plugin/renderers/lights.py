@@ -24,7 +24,10 @@ STREET_CD = 1000.0
 HEAD_CD = 20_000.0  # both low beams of a vehicle
 # Tangents: where a beam has fallen to 1/e sideways and below, its upper edge (ECE R112), and how
 # soft that is.
-BEAM_WIDTH, BEAM_DEPTH, CUT_OFF, EDGE = 0.25, 0.08, -0.01, 0.015
+BEAM_WIDTH = 0.25
+BEAM_DEPTH = 0.08
+CUT_OFF = -0.01
+EDGE = 0.015
 ABOVE_CUT_OFF = 0.01
 LAMP_HEIGHT_M = 0.65
 WITH_LAMPS = ("car", "truck", "bus", "motorcycle")
@@ -71,11 +74,13 @@ class SceneLights:
                 tips.append(posts.tip[site.owns(posts.plan)])
                 half_m, places, facing = lit_windows(site, houses)
                 self.windows += [
-                    Spot(*one, half_m, WINDOW_RGB) for one in zip(places, facing, strict=True)
+                    Spot(*actor, half_m, WINDOW_RGB) for actor in zip(places, facing, strict=True)
                 ]
             self.tips = np.concatenate(tips)
-        driven = [one for one in scenario.actors if one.label in WITH_LAMPS and not one.is_static]
-        self.boxes = {one.actor_id: one.box for one in driven}
+        driven = [
+            actor for actor in scenario.actors if actor.label in WITH_LAMPS and not actor.is_static
+        ]
+        self.boxes = {actor.actor_id: actor.box for actor in driven}
         self.ego_front_m = (
             scenario.vehicle.rear_axle_to_centre_m + scenario.vehicle.box.length_m / 2
         )
@@ -114,8 +119,8 @@ class SceneLights:
             state = signal.colour_at(t_us).split("_")
             for row, (colour, rgb) in enumerate(SIGNAL_RGB.items()):
                 middle = signal.head + np.array([0.0, 0.0, (1 - row) * SIGNAL_STEP_M])
-                shown = rgb if colour in state else DARK_RGB
-                spots.append(Spot(middle, facing, SIGNAL_STEP_M / 2, shown))
+                lamp_rgb = rgb if colour in state else DARK_RGB
+                spots.append(Spot(middle, facing, SIGNAL_STEP_M / 2, lamp_rgb))
         if not self.is_night:
             return spots
         spots += [Spot(tip, np.zeros(3), 0.25, STREET_RGB) for tip in self.tips]

@@ -57,7 +57,7 @@ class Precipitation:
         per_mm = self.slope[0] * rate_mm_per_h ** self.slope[1]
         per_m3 = self.density[0] * rate_mm_per_h ** self.density[1] / per_mm * np.exp(-per_mm)
         area = shape[0] * shape[1] / (K[0, 0] * K[1, 1])  # of the view at 1 m
-        drawn = np.zeros(shape, np.float32)
+        cover = np.zeros(shape, np.float32)
         for far_m, near_m in pairwise(SHELLS_M):
             px_per_m = K[1, 1] * 2 / (far_m + near_m)
             size_px = px_per_m * self.size_m
@@ -69,8 +69,8 @@ class Precipitation:
                 16 * np.stack([begin, begin + np.array([0, fallen_px])], axis=1)
             ).astype(np.int32)
             width_px = max(1, int(size_px))
-            cv2.polylines(drawn, list(lines), False, share, width_px, cv2.LINE_8, SUBPIXEL_BITS)
-        return drawn
+            cv2.polylines(cover, list(lines), False, share, width_px, cv2.LINE_8, SUBPIXEL_BITS)
+        return cover
 
 
 # Drops: Marshall and Palmer, 1948; speed 5.5 m/s (Atlas et al., 1973). Flakes: Gunn and Marshall,

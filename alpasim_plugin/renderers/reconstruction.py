@@ -159,13 +159,14 @@ def ensure(
     not there.
     """
     key = reconstruction_key(scenario, recipe)
+    # Needs torch, which a cached reconstruction does not
     from alpasim_plugin.renderers.reconstruction_build import (
         build,
-    )  # needs torch, which a cached reconstruction does not
+    )
 
-    what = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
+    name = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
     make = partial(build, scenario, recipe, threads, device)
-    return cached(KIND, key, make, read_model, what)
+    return cached(KIND, key, make, read_model, name)
 
 
 def _graph(model: Reconstruction, scenario: Scenario) -> SceneGraph:
@@ -220,14 +221,14 @@ class ImportedRenderer(SplatRenderer):
 
     def draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
         """Draw images with the sky as an opaque layer without depth."""
-        known = [
+        graph_views = [
             (camera, {name: T for name, T in actors.items() if name in self.graph.actors})
             for camera, actors in views
         ]
-        outs = self.graph.render_all(known, self.threads, self.device)
+        outs = self.graph.render_all(graph_views, self.threads, self.device)
         return [
             out.with_sky(camera.above_horizon())
-            for out, (camera, _) in zip(outs, known, strict=True)
+            for out, (camera, _) in zip(outs, graph_views, strict=True)
         ]
 
 

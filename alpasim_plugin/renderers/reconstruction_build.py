@@ -87,7 +87,9 @@ def build(
 
 
 PATCH_SHARE = 0.075  # of the image's width: neighbours within a patch are wrong together
-LEAST, MOST = 0.5, 2.0  # a depth is never wrong by more than these factors
+# A depth is never wrong by more than these factors
+LEAST = 0.5
+MOST = 2.0
 
 
 def misplaced(

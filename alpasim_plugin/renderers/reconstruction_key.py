@@ -33,7 +33,8 @@ POINTS_PER_S = 2_400
 FULL_STEPS_PER_S = 50.0
 LONGEST_S = 30.0  # a longer log gets the points and steps of so many seconds
 REFUSED_S = 120.0  # of a longer log next to nothing would be left
-FEWEST_VIEWS, MOST_VIEWS = 12, 180  # the latter by camera
+FEWEST_VIEWS = 12
+MOST_VIEWS = 180  # by camera
 ACTOR_POINTS = 400  # by camera
 # A camera that looks ahead sees a surface for seconds, one that looks to the side for less than
 # one: with several, start points come from every second instant, and each view is learned from twice
@@ -47,7 +48,8 @@ STEPS_RIG = 2.0
 SHARP = 2
 
 
-STEP_CPU_S, POINT_CPU_S = 0.06, 7e-7  # of a fit, by step, and by step and point
+STEP_CPU_S = 0.06  # of a fit, by step
+POINT_CPU_S = 7e-7  # of a fit, by step and point
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,8 @@ def fit_cpu_s(scenario: Scenario, pinholes: int) -> float:
     log_s = float(np.ptp(scenario.ego_log.t_us)) * 1e-6
     if scenario.model is not None or scenario.degradation.kind == "none" or log_s > REFUSED_S:
         return 0.0
-    drawn = tuple(islice(cycle(scenario.cameras), pinholes))
-    splat = recipe_of(replace(scenario, cameras=drawn)).splat
+    cameras = tuple(islice(cycle(scenario.cameras), pinholes))
+    splat = recipe_of(replace(scenario, cameras=cameras)).splat
     return splat.steps * (STEP_CPU_S + POINT_CPU_S * splat.points)
 
 

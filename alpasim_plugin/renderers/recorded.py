@@ -25,10 +25,8 @@ from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
-INTERVAL_US, FIRST_US = (
-    500_000,
-    50_000,
-)  # from the log's start; between the frames of a camera at 10 Hz, of which none is a recorded one
+INTERVAL_US = 500_000  # from the log's start
+FIRST_US = 50_000  # between the frames of a camera at 10 Hz, of which none is a recorded one
 # the error of poses is drawn this often and interpolated: registration drifts, it does not jump
 POSE_KNOT_US = 700_000
 # of rendered images and depths that a built scene's recording keeps: 48 of 512x288, three of
@@ -37,12 +35,10 @@ KEPT_BYTES = 50_000_000
 TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 BYTES_PER_PX = 7  # three of colour, four of depth
-Model = Callable[
-    [PinholeCamera, Mapping[str, F64]], RasterOutput
-]  # renders a view of the reconstruction
-DepthFrom = Callable[
-    [PinholeCamera, Mapping[str, F64]], F32
-]  # camera, actor poses -> depth (H, W) metres, 0 where there is none
+# Renders a view of the reconstruction
+Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
+# Camera, actor poses -> depth (H, W) metres, 0 where there is none
+DepthFrom = Callable[[PinholeCamera, Mapping[str, F64]], F32]
 
 
 def built_recording(
@@ -112,8 +108,10 @@ def believed_pose(
     """
     knot, after_us = divmod(t_us, POSE_KNOT_US)
     before, after = (
-        stream(scene_id, seed, f"reconstruction.poses.{lens_camera(camera)}", at).standard_normal(6)
-        for at in (knot, knot + 1)
+        stream(
+            scene_id, seed, f"reconstruction.poses.{lens_camera(camera)}", number
+        ).standard_normal(6)
+        for number in (knot, knot + 1)
     )
     error = spread_m * (before + (after - before) * after_us / POSE_KNOT_US)
     moved = rigid(cv2.Rodrigues(TURN_RAD_PER_M * error[3:])[0], error[:3])
@@ -135,38 +133,52 @@ def photograph_recording(scenario: Scenario, depth_from: DepthFrom) -> tuple[Rec
     """
     widths = {camera.name: camera.width for camera in scenario.cameras}
     frames = []
-    for one in sorted(scenario.recording, key=lambda one: (one.t_us, one.camera)):
-        if one.use != "fitted":
+    for photograph in sorted(
+        scenario.recording, key=lambda photograph: (photograph.t_us, photograph.camera)
+    ):
+        if photograph.use != "fitted":
             continue
-        camera = photograph_camera(one, widths.get(one.camera, one.width))
-        actors = log_actors(scenario, one.t_us)
-        read = partial(_read, one, camera, partial(depth_from, camera, actors))
+        camera = photograph_camera(photograph, widths.get(photograph.camera, photograph.width))
+        actors = log_actors(scenario, photograph.t_us)
+        read = partial(_read, photograph, camera, partial(depth_from, camera, actors))
         frames.append(
-            RecordedFrame(one.t_us, one.camera, camera.K, one.T_world_camera, actors, read)
+            RecordedFrame(
+                photograph.t_us,
+                photograph.camera,
+                camera.K,
+                photograph.T_world_camera,
+                actors,
+                read,
+            )
         )
     return tuple(frames)
 
 
-def photograph_camera(one: Photograph, width: int) -> PinholeCamera:
+def photograph_camera(photograph: Photograph, width: int) -> PinholeCamera:
     """Return a photograph's camera with so many pixels across, never more than it has."""
-    w = min(width, one.width)
-    h = max(1, round(one.height * w / one.width))
+    w = min(width, photograph.width)
+    h = max(1, round(photograph.height * w / photograph.width))
     return PinholeCamera.from_pose(
-        w, h, np.diag([w / one.width, h / one.height, 1.0]) @ one.K, one.T_world_camera
+        w,
+        h,
+        np.diag([w / photograph.width, h / photograph.height, 1.0]) @ photograph.K,
+        photograph.T_world_camera,
     )
 
 
-def photograph_image(one: Photograph, camera: PinholeCamera) -> U8:
+def photograph_image(photograph: Photograph, camera: PinholeCamera) -> U8:
     """Read a photograph at the size of its camera ``(H, W, 3)``.
 
     Raises:
         InputError: The file is missing or damaged.
     """
-    rgb = read_image(Path(one.path))[..., ::-1]
+    rgb = read_image(Path(photograph.path))[..., ::-1]
     size = camera.width, camera.height
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(small, np.uint8)
 
 
-def _read(one: Photograph, camera: PinholeCamera, depth: Callable[[], F32]) -> tuple[U8, F32]:
-    return photograph_image(one, camera), depth()
+def _read(
+    photograph: Photograph, camera: PinholeCamera, depth: Callable[[], F32]
+) -> tuple[U8, F32]:
+    return photograph_image(photograph, camera), depth()

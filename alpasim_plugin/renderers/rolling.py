@@ -64,10 +64,10 @@ def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) ->
         the pose at the pixel's time.
     """
     cuts = [_cut(request, device) for request in requests]
-    drawn = iter(draw([view for cut in cuts for _, view in cut]))
+    frames = iter(draw([view for cut in cuts for _, view in cut]))
     outs = []
     for request, cut in zip(requests, cuts, strict=True):
-        out, *_ = parts = [next(drawn) for _ in cut]
+        out, *_ = parts = [next(frames) for _ in cut]
         again = partial(draw_requests, [request], draw, device)
         if cut[0][0] is not None:
             out = out.blank(request.camera.height, request.camera.width, parts, again)

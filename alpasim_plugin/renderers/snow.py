@@ -11,9 +11,12 @@ from alpasim_plugin.world.path import polyline_path
 
 ALBEDO = 0.8  # of snow that is not fresh any more
 BESIDE = 0.95  # the share of the ground that snow hides beside lanes
-LANE, TRACK = 0.6, 0.15  # on them, and in the tracks of wheels
+LANE = 0.6  # on lanes
+TRACK = 0.15  # in the tracks of wheels
 STRIPS_M = ((LANE, -1.75, 1.75), (TRACK, -1.05, -0.55), (TRACK, 0.55, 1.05))  # across a lane
-STEP_M, SIGHT_M, NEAREST_M = 2.0, 150.0, 0.3
+STEP_M = 2.0
+SIGHT_M = 150.0
+NEAREST_M = 0.3
 SOFT_WIDTHS = 0.002  # of the edges of tracks, in image widths
 SUBPIXEL_BITS = 4  # sixteenths
 

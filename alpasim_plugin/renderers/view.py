@@ -11,7 +11,9 @@ from alpasim_plugin.world.ground import height_at
 
 # What is less than this above the ground, and so much more with distance, is ground that the model
 # shows too near, unless it is about so near to a road user; what is twice as high is none.
-GROUND_M, GROUND_PER_M, BOX_M = 0.35, 0.015, 0.2
+GROUND_M = 0.35
+GROUND_PER_M = 0.015
+BOX_M = 0.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,9 @@ KOSCHMIEDER = 3.912  # -ln(0.02)
 STEPS = 4095  # of the table from linear light to bytes
 # At night, in lux: what a camera shows as white, and the light of the sky over a town; in white:
 # what it compresses any light of lamps to.
-WHITE_LUX, SKY_LUX, BRIGHTEST = 6.0, 0.25, 3.0
+WHITE_LUX = 6.0
+SKY_LUX = 0.25
+BRIGHTEST = 3.0
 LIGHT_RGB = {
     "day": (1.0, 1.0, 1.0),
     "low_sun": (1.0, 0.76, 0.54),  # about 3500 K
@@ -42,8 +44,11 @@ SUN_TANGENT = 0.1  # of its height
 # Veiling light of a lens about the sun, in white times square degrees, about a tenth of what Stiles
 # and Holladay found for the eye (CIE 146).
 VEIL_DEG2 = 6.0
-SEEN_M, SEEN_PER_M = 0.5, 0.03  # a lamp so much behind what is rendered is seen
-GLOW_SHARE, GLOW_WIDTHS = 0.3, 0.008  # of a lamp's light about it, and how far, in image widths
+# A lamp so much behind what is rendered is seen
+SEEN_M = 0.5
+SEEN_PER_M = 0.03
+GLOW_SHARE = 0.3  # of a lamp's light about it
+GLOW_WIDTHS = 0.008  # how far that light reaches, in image widths
 SMEAR_HEIGHTS = 0.06  # of a lamp's reflection on a rough wet road, in image heights
 
 
@@ -242,13 +247,17 @@ class WeatherRenderer(Renderer):
 def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:
     """Draw spots that nothing hides into an image, and return their glow."""
     colours, depth = drawn(spots, view)
-    seen = (depth < view.depth_m * (1 + SEEN_PER_M) + SEEN_M) & np.isfinite(depth)
-    light[seen] = colours[seen]
-    colours[~seen] = 0
+    visible = (depth < view.depth_m * (1 + SEEN_PER_M) + SEEN_M) & np.isfinite(depth)
+    light[visible] = colours[visible]
+    colours[~visible] = 0
     return cv2.GaussianBlur(colours, (0, 0), GLOW_WIDTHS * light.shape[1]) * np.float32(GLOW_SHARE)
 
 
 def in_weather(renderer: Renderer, scenario: Scenario, seed: int) -> Renderer:
     """Return a renderer in the weather of a scene; itself where nothing of it is seen."""
-    shown = WeatherRenderer(renderer, scenario, seed)
-    return renderer if shown.is_clear and not shown.lights.signals else shown
+    weather_renderer = WeatherRenderer(renderer, scenario, seed)
+    return (
+        renderer
+        if weather_renderer.is_clear and not weather_renderer.lights.signals
+        else weather_renderer
+    )

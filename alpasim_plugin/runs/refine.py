@@ -249,7 +249,7 @@ def refine_video(
             stack.enter_context(writers[role])
         timing: list[TimedFrame] = []  # of the current block
         for block in refine_frames(_joined(readers, timing), fixer, limit):
-            for timed, source_frame, fixed in zip(timing, block.given, block.fixed, strict=True):
+            for timed, source_frame, fixed in zip(timing, block.frames, block.fixed, strict=True):
                 writers["output"].write(fixed.rgb, timed.time, timed.duration)
                 if "compare" in writers:
                     writers["compare"].write(

@@ -32,7 +32,8 @@ from alpasim_plugin.streets.surfels import (
     with_sheen,
 )
 
-OUTSIDE_M, SPILL = 0.1, 0.05  # how far, and what share of, an appearance may leave the box
+OUTSIDE_M = 0.1  # how far an appearance may leave the box
+SPILL = 0.05  # the share of it that may
 CELLS_M = (0.09, 0.22, 0.6)
 BODY_RGB = np.array(
     [
@@ -66,7 +67,9 @@ GLASS_RGB = np.array([0.10, 0.12, 0.14])
 TYRE_RGB = np.array([0.07, 0.07, 0.075])
 HUB_RGB = np.array([0.50, 0.51, 0.53])
 RGB = tuple[float, float, float]
-HEAD_RGB, TAIL_RGB, PLATE_RGB = (0.96, 0.96, 0.88), (0.80, 0.06, 0.05), (0.88, 0.88, 0.86)
+HEAD_RGB = (0.96, 0.96, 0.88)
+TAIL_RGB = (0.80, 0.06, 0.05)
+PLATE_RGB = (0.88, 0.88, 0.86)
 
 
 def build_actors(scenario: Scenario) -> list[SceneNode]:
@@ -236,7 +239,8 @@ def _person(
     coat = _drawn(CLOTHES_RGB, draw[2])
     legs = _drawn(CLOTHES_RGB, draw[3]) * 0.8
     skin = _drawn(SKIN_RGB, draw[4])
-    body = [  # x, y, z as shares of height, then sigma x, y, z as shares, then colour
+    # x, y, z as shares of height, then sigma x, y, z as shares, then colour
+    body = [
         (0.5 * lean, 0.0, 0.92, 0.040, 0.036, 0.048, skin),
         (0.5 * lean - 0.01, 0.0, 0.955, 0.042, 0.038, 0.026, np.array([0.16, 0.12, 0.09])),
         (0.3 * lean, 0.0, 0.75, 0.050, 0.075, 0.062, coat),

@@ -132,9 +132,8 @@ def paint_ground(
         cap = np.clip(0.06 * path, 0.5, 4.0)
     wanted = np.clip(0.6 * feature, cell_m, np.maximum(cap, cell_m))
     level = np.floor(np.log2(wanted / cell_m) + 1e-6).astype(np.int64)
-    trench = (near_marking < TRENCH_M) & (
-        edge > TRENCH_M
-    )  # not at the kerb's foot: a gap would open there
+    # Not at the kerb's foot: a gap would open there
+    trench = (near_marking < TRENCH_M) & (edge > TRENCH_M)
     height = np.where(road, np.where(trench, -TRENCH_DEPTH_M, 0.0), 0.0 if site.highway else KERB_M)
     return GroundTexture(cell_m, low, np.clip(rgb, 0, 1), height.astype(np.float32), level)
 

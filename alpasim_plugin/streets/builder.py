@@ -25,11 +25,12 @@ from alpasim_plugin.streets.markings import marking_strokes
 from alpasim_plugin.streets.site import HeightAt, make_site, path_of, section_of
 from alpasim_plugin.world.ground import BUILT_WHOLE_M, SIGHT_M
 
+# On everything but the sky, by sky
 LIGHT = {
     "clear": (1.0, 1.0, 1.0),
     "overcast": (0.86, 0.88, 0.91),
     "dusk": (0.74, 0.63, 0.62),
-}  # on everything but the sky, by sky
+}
 
 
 def build_scene(scenario: Scenario, height_at: HeightAt) -> SceneGraph:

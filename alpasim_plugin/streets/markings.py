@@ -14,7 +14,9 @@ from alpasim_plugin.core.types import F64, I64, LaneMarkType
 from alpasim_plugin.streets.site import CELL_M, Site
 from alpasim_plugin.world.markings import marking_lines
 
-LINE_M, GAP_M = 3.0, 9.0  # dash pattern
+# Dash pattern
+LINE_M = 3.0
+GAP_M = 9.0
 LINE_WIDTH_M = 0.14
 DOUBLE_OFFSET_M = 0.16
 STEP_M = 0.75  # length of a stroke of a line; a quarter of a dash

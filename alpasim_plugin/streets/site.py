@@ -40,7 +40,8 @@ SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
 HIGHWAY_MPS = 22.0
 TILE_M = 32.0  # a section owns whole tiles; all grids of the ground are cut along them
 HORIZON_M = 160.0  # large Gaussians lie so far around the rasters
-SECTION_M, OVERLAP_M = 250, 40  # of the path; a section's path goes on into its neighbours
+SECTION_M = 250  # of the path
+OVERLAP_M = 40  # a section's path goes on into its neighbours
 
 
 @dataclass(frozen=True)

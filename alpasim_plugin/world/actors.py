@@ -61,7 +61,11 @@ FADE_STEP_M = 2.0
 SPEED_SPAN_US = 100_000
 DRIVING = ("idm", "adversary")  # behaviours of those who leave their track
 # An adversary: share of its speed between which it chooses, gain and time of its control.
-SLOWEST, FASTEST, PULL_PER_S, CONTROL_S, MAX_ACCEL_MPS2 = 0.5, 1.5, 1.0, 0.5, 3.0
+SLOWEST = 0.5
+FASTEST = 1.5
+PULL_PER_S = 1.0
+CONTROL_S = 0.5
+MAX_ACCEL_MPS2 = 3.0
 
 
 class Actors:
@@ -129,10 +133,10 @@ class Actors:
             yaw = yaw_of(ego.T_world_rig)
             direction = direction_of(yaw)
             centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
-            own = bodies_from(
+            reactive = bodies_from(
                 centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
             )
-            others = concatenate([own, bodies])
+            others = concatenate([reactive, bodies])
             self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
         for driver in self.drivers:
             pose = driver.pose(t_us, self.closed_us, driver.motion)
@@ -179,9 +183,9 @@ class Actors:
                 np.array([driver.horizon_m(motion) for driver, motion in driving]),
                 np.arange(len(others.xy), len(everybody.xy)),
             )
-            own = len(others.xy)
+            first_moving = len(others.xy)
             for row, ((driver, motion), leader) in enumerate(zip(driving, leaders, strict=True)):
-                accel_mps2 = driver.accel_mps2(motion, leader, everybody, own + row, to_us)
+                accel_mps2 = driver.accel_mps2(motion, leader, everybody, first_moving + row, to_us)
                 driver.move(motion, accel_mps2, dt_s)
 
 
@@ -356,10 +360,10 @@ class _Driver:
         if from_us > last:
             self.present = False  # the track ended while the log was forced
             return
-        at = max(from_us, first)
-        lo = max(first, at - SPEED_SPAN_US)
-        hi = min(last, at + SPEED_SPAN_US)
-        s, d = self.path.project(interpolate(self.actor.track, [at, lo, hi])[:, :2, 3])
+        takeover_us = max(from_us, first)
+        lo = max(first, takeover_us - SPEED_SPAN_US)
+        hi = min(last, takeover_us + SPEED_SPAN_US)
+        s, d = self.path.project(interpolate(self.actor.track, [takeover_us, lo, hi])[:, :2, 3])
         speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
         self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
 
@@ -370,7 +374,7 @@ class _Driver:
         return 20.0 + 2.0 * wanted_gap_m(motion.speed_mps, motion.speed_mps, self.params)
 
     def accel_mps2(
-        self, motion: _Motion, leader: Leader, bodies: Bodies, own: int, t_us: int
+        self, motion: _Motion, leader: Leader, bodies: Bodies, row: int, t_us: int
     ) -> float:
         """Return the acceleration behind a leader and before a line to stop at; of an adversary that
         by which it acts on the ego, the first of the bodies.
@@ -386,7 +390,7 @@ class _Driver:
             return against if leader.index <= 0 else min(against, behind)
         stop_m = min(
             red_gap_m(self.lights, front_m, speed_mps, t_us),
-            give_way_gap_m(self.give_way, self.path, front_m, bodies, own),
+            give_way_gap_m(self.give_way, self.path, front_m, bodies, row),
         )
         return min(behind, idm_acceleration(speed_mps, stop_m, speed_mps, params))
 
@@ -395,8 +399,8 @@ class _Driver:
         ``gap_m`` ahead of the ego, within bounds of its speed; from there on it takes another speed.
         """
         assert self.path is not None
-        there = interpolate(self.actor.track, round(act["act_us"]))[None, :2, 3]
-        act_s_m, ego_s_m = (float(self.path.project(xy)[0][0]) for xy in (there, bodies.xy[:1]))
+        act_xy = interpolate(self.actor.track, round(act["act_us"]))[None, :2, 3]
+        act_s_m, ego_s_m = (float(self.path.project(xy)[0][0]) for xy in (act_xy, bodies.xy[:1]))
         wanted_mps = act["end_speed_mps"]
         if motion.s_m < act_s_m:
             front_m = ego_s_m + float(bodies.half_length_m[0]) + act["gap_m"]
@@ -446,7 +450,7 @@ def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
         lane: abs(float(wrap_angle(index.heading_rad(lane, end) - heading)))
         for lane in index.containing(end[:2])
     }
-    lane = min(turns, key=lambda one: turns[one], default=None)
+    lane = min(turns, key=lambda lane_id: turns[lane_id], default=None)
     if lane is None or turns[lane] >= MAX_TURN_RAD:
         return None
     xyz = index.path_ahead(lane, EXTENSION_M, start=end).xyz

@@ -102,8 +102,8 @@ def ground_poses(field: HeightField, xy: F64, yaw: F64) -> F64:
     h = SLOPE_SPAN_M
     ahead = np.column_stack([c * h, s * h])
     left = np.column_stack([-s * h, c * h])
-    at = np.concatenate([xy, xy + ahead, xy - ahead, xy + left, xy - left])
-    z = height_at(field, at).reshape(5, -1)
+    samples = np.concatenate([xy, xy + ahead, xy - ahead, xy + left, xy - left])
+    z = height_at(field, samples).reshape(5, -1)
     along = (z[1] - z[2]) / (2 * h)
     across = (z[3] - z[4]) / (2 * h)
     ex = np.column_stack([c, s, along]) / np.sqrt(1 + along * along)[:, None]

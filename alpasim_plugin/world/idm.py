@@ -146,8 +146,8 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
         [turn[0, :, None] * x - turn[1, :, None] * y, turn[1, :, None] * x + turn[0, :, None] * y],
         axis=-1,
     )
-    every = [np.repeat(number, len(_OUTLINE)) for number in (line, low, high)]
-    along, across = lines.project(every[0], outline.reshape(-1, 2), *every[1:])
+    per_corner = [np.repeat(number, len(_OUTLINE)) for number in (line, low, high)]
+    along, across = lines.project(per_corner[0], outline.reshape(-1, 2), *per_corner[1:])
     along = along.reshape(-1, len(_OUTLINE))
     across = across.reshape(-1, len(_OUTLINE))
     rear = along.min(axis=1)

@@ -58,11 +58,13 @@ class _Edges:
         self.owner: I64 = np.concatenate(owner)
         self.headings: F64 = np.concatenate(headings)
         samples = shapely.points(np.concatenate(points))
-        of, near = shapely.STRtree(samples).query(
+        sample, near = shapely.STRtree(samples).query(
             samples, predicate="dwithin", distance=SAME_EDGE_M
         )
-        order = np.argsort(of, kind="stable")
-        self.near = np.split(near[order], np.searchsorted(of[order], np.arange(1, len(samples))))
+        order = np.argsort(sample, kind="stable")
+        self.near = np.split(
+            near[order], np.searchsorted(sample[order], np.arange(1, len(samples)))
+        )
 
     def beside(self, i: int) -> list[list[tuple[int, float]]]:
         """Return for every sample of edge ``i`` the other edges there, each with the cosine between
@@ -134,13 +136,16 @@ def _default(edges: _Edges, i: int) -> LaneMarkType:
             edge.mark_type for edge in edges.all if edge.mark_type not in ("none", "unknown")
         ),
     ):
-        known = [
-            any(edges.all[j].mark_type == mark_type and abs(cosine) > ALONG for j, cosine in here)
-            for here in samples
+        is_marked = [
+            any(
+                edges.all[j].mark_type == mark_type and abs(cosine) > ALONG
+                for j, cosine in neighbours
+            )
+            for neighbours in samples
         ]
-        if np.mean(known) > COVERED:
+        if np.mean(is_marked) > COVERED:
             return mark_type
-    beside = [(edges.all[j], cosine) for here in samples for j, cosine in here]
+    beside = [(edges.all[j], cosine) for neighbours in samples for j, cosine in neighbours]
     shared = sum(other.side == -edges.all[i].side and cosine > ALONG for other, cosine in beside)
     opposing = sum(other.side == edges.all[i].side and cosine < -ALONG for other, cosine in beside)
     if max(shared, opposing) < 0.4 * len(samples):

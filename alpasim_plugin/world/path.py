@@ -54,8 +54,8 @@ def sample_clothoid(
     rate = (end_curvature_per_m - start_curvature_per_m) / length_m
     x0, y0, yaw0 = start
 
-    def heading(at: F64) -> F64:
-        return yaw0 + at * (start_curvature_per_m + 0.5 * rate * at)
+    def heading(s_m: F64) -> F64:
+        return yaw0 + s_m * (start_curvature_per_m + 0.5 * rate * s_m)
 
     half = 0.5 * np.diff(s)[:, None]
     yaw_at_nodes = heading(0.5 * (s[1:] + s[:-1])[:, None] + half * _NODES)  # (N - 1, 8)
@@ -180,15 +180,15 @@ class Path:
 
 
 def _from_station(
-    rest: F64, yaw: F64, curvature: F64, is_first: Bool, is_last: Bool
+    offset: F64, yaw: F64, curvature: F64, is_first: Bool, is_last: Bool
 ) -> tuple[F64, F64]:
-    """Return arc length and signed distance, both from the nearest station, of points at ``rest``
+    """Return arc length and signed distance, both from the nearest station, of points at ``offset``
     from it: on the circle of its curvature, and on its straight tangent beyond the path's ends.
     """
     c = np.cos(yaw)
     s = np.sin(yaw)
-    along = c * rest[:, 0] + s * rest[:, 1]
-    across = c * rest[:, 1] - s * rest[:, 0]
+    along = c * offset[:, 0] + s * offset[:, 1]
+    across = c * offset[:, 1] - s * offset[:, 0]
     beyond = (is_first & (along < 0)) | (is_last & (along > 0))
     k = np.where(beyond | (np.abs(curvature) < 1e-9), 1e-9, curvature)
     radial = 1.0 - k * across
@@ -262,14 +262,14 @@ class Lines:
         )
         return self.s[i] + along, across
 
-    def _squares(self, xy: F64, low: I64, high: I64, every: int) -> F64:
+    def _squares(self, xy: F64, low: I64, high: I64, stride: int) -> F64:
         """Return the squared distances ``(P, n)`` of points to every n-th station of a range; the
         last station stands for those beyond it.
         """
-        count = max(-(-int((high - low).max(initial=0)) // every), 1)
-        at = np.minimum(low[:, None] + every * np.arange(count), high[:, None] - 1)
-        dx = xy[:, :1] - self._x[at]
-        dy = xy[:, 1:] - self._y[at]
+        count = max(-(-int((high - low).max(initial=0)) // stride), 1)
+        stations = np.minimum(low[:, None] + stride * np.arange(count), high[:, None] - 1)
+        dx = xy[:, :1] - self._x[stations]
+        dy = xy[:, 1:] - self._y[stations]
         return dx * dx + dy * dy
 
 

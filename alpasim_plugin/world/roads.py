@@ -88,8 +88,8 @@ def _grow_intersection(
         if turn not in element.arms:
             continue
         heading = yaw + _ANGLE[turn]
-        at = centre + reach * direction_of(heading)
-        start = (float(at[0]), float(at[1]), float(heading))
+        arm_start = centre + reach * direction_of(heading)
+        start = (float(arm_start[0]), float(arm_start[1]), float(heading))
         if turn == element.turn:
             tip.pose = start
             stub = sample_clothoid(start, 1.0, 0.0, 0.0)
@@ -233,12 +233,12 @@ class Road:
         The chain stops where the lane does not go on.
         """
         out = []
-        at: int | None = lane
+        index: int | None = lane
         for part in self.stretches[stretch:]:
-            if at is None or at >= len(part.forward) or part.forward[at] is None:
+            if index is None or index >= len(part.forward) or part.forward[index] is None:
                 break
-            out.append((str(part.forward[at]), at))
-            at = part.forward_next[at]
+            out.append((str(part.forward[index]), index))
+            index = part.forward_next[index]
         return out
 
     def backward_chain(self, lane: int) -> list[str]:

@@ -72,10 +72,10 @@ class LaneIndex:
     def containing_many(self, xy: F64) -> list[tuple[str, ...]]:
         """Return `containing` for each of ``(N, 2+)`` points at once."""
         points = shapely.points(np.ascontiguousarray(xy[:, :2]))
-        found: list[list[int]] = [[] for _ in range(len(xy))]
+        lane_numbers: list[list[int]] = [[] for _ in range(len(xy))]
         for i, j in self._tree.query(points, predicate="intersects").T.tolist():
-            found[i].append(j)
-        return [tuple(self.ids[j] for j in sorted(js)) for js in found]
+            lane_numbers[i].append(j)
+        return [tuple(self.ids[j] for j in sorted(js)) for js in lane_numbers]
 
     def within(self, point: F64, radius_m: float) -> tuple[str, ...]:
         """Return the lanes that have a centre vertex within ``radius_m``."""
@@ -103,13 +103,13 @@ class LaneIndex:
         The whole turn over the follower is compared and not its first segment: at an intersection
         all branches leave in the same direction and part only later.
         """
-        here = _end_heading(self.lane_map.lanes[lane_id].centre, last=True)
+        heading = _end_heading(self.lane_map.lanes[lane_id].centre, last=True)
 
         def turn(other: str) -> float:
             line = self.lane_map.lanes[other].centre
             start = _end_heading(line, last=False)
             end = _end_heading(line, last=True)
-            return float(abs(wrap_angle(start - here)) + abs(wrap_angle(end - start)))
+            return float(abs(wrap_angle(start - heading)) + abs(wrap_angle(end - start)))
 
         followers = self.successors(lane_id)
         return min(followers, key=turn) if followers else None
@@ -126,8 +126,8 @@ class LaneIndex:
         line = self.lane_map.lanes[lane_id].centre
         begin = 0.0 if start is None else project(line, start)[0]
         ids = [lane_id]
-        rest = line[arc_lengths(line) > begin + 1e-9]
-        parts = [np.concatenate([resample(line, [begin]), rest])]
+        following = line[arc_lengths(line) > begin + 1e-9]
+        parts = [np.concatenate([resample(line, [begin]), following])]
         left = distance_m - float(arc_lengths(parts[0])[-1])
         current: str | None = lane_id
         while left > 0:
@@ -232,13 +232,13 @@ def match_lanes(index: LaneIndex, path: F64, first_heading_rad: float) -> tuple[
     Samples in no lane's reach name no lane.
     """
     total = float(arc_lengths(path)[-1])
-    at = np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
+    stations = np.linspace(0.0, total, max(int(np.ceil(total / SAMPLE_M)), 1) + 1)
     points = path[:1]
     headings = np.array([first_heading_rad])
     if total > 0:
-        points = resample(path, at)
-        behind = resample(path, np.maximum(at - SAMPLE_M / 2, 0.0))
-        ahead = resample(path, np.minimum(at + SAMPLE_M / 2, total)) - behind
+        points = resample(path, stations)
+        behind = resample(path, np.maximum(stations - SAMPLE_M / 2, 0.0))
+        ahead = resample(path, np.minimum(stations + SAMPLE_M / 2, total)) - behind
         headings = heading_of(ahead)
     inside = index.containing_many(points)
     layers: list[dict[str, tuple[float, str | None]]] = []
@@ -310,10 +310,12 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     error = np.abs(wrap_angle(heading_of(step) - yaw_of(T_world_rig)))
     i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
     begin = float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
-    at = begin + spacing_m * np.arange(n)
-    seen = at <= along[-1] + 1e-9
-    out[seen] = transform_points(inverse(T_world_rig), resample(line, at[seen], along))
-    out[seen, 2] = 0.0
+    stations = begin + spacing_m * np.arange(n)
+    on_route = stations <= along[-1] + 1e-9
+    out[on_route] = transform_points(
+        inverse(T_world_rig), resample(line, stations[on_route], along)
+    )
+    out[on_route, 2] = 0.0
     return out
 
 

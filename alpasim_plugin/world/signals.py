@@ -13,7 +13,8 @@ from alpasim_plugin.world.path import Path
 
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
 SEEN_M = 30.0  # others are looked for from so far before a line to give way at
-CROSSED_M, CROSSED_S = 20.0, np.arange(0.0, 4.1, 0.5)  # behind the line, and so long ahead
+CROSSED_M = 20.0  # behind the line
+CROSSED_S = np.arange(0.0, 4.1, 0.5)  # ahead in time
 LATERAL_M = 2.5  # who comes nearer to the own way is let pass
 MOVING_MPS = 0.5
 
@@ -28,14 +29,14 @@ class LightAhead:
 
 def lights_on(path: Path, signals: Sequence[Signal] | None) -> tuple[LightAhead, ...]:
     """Return the lights for vehicles whose lines a path passes in their direction, in its order."""
-    found = []
+    lights = []
     for signal in signals or ():
         if signal.pedestrians:
             continue
         for k, share in signal.crossings(path.xyz, np.zeros(3)):
             s_m = path.s[k] + share * (path.s[k + 1] - path.s[k])
-            found.append(LightAhead(float(s_m), signal))
-    return tuple(sorted(found, key=lambda light: light.s_m))
+            lights.append(LightAhead(float(s_m), signal))
+    return tuple(sorted(lights, key=lambda light: light.s_m))
 
 
 def red_gap_m(lights: Sequence[LightAhead], front_s_m: float, speed_mps: float, t_us: int) -> float:
@@ -56,7 +57,7 @@ def red_gap_m(lights: Sequence[LightAhead], front_s_m: float, speed_mps: float, 
 
 
 def give_way_gap_m(
-    lines: Sequence[LightAhead], path: Path, front_s_m: float, bodies: Bodies, own: int
+    lines: Sequence[LightAhead], path: Path, front_s_m: float, bodies: Bodies, row: int
 ) -> float:
     """Return the distance from the front bumper to the nearest line at which others are to be let
     pass; infinite without one.
@@ -69,7 +70,7 @@ def give_way_gap_m(
         path: The driver's way.
         front_s_m: Arc length of the front bumper.
         bodies: Everybody.
-        own: The driver's row among them, -1: none.
+        row: The driver's row among them, -1: none.
     """
     for line in lines:
         gap_m = line.s_m - front_s_m
@@ -79,7 +80,7 @@ def give_way_gap_m(
         s_m, offset_m = path.project(bodies.xy)
         counts = (s_m > line.s_m) | (np.abs(offset_m) > LATERAL_M)
         counts &= np.linalg.norm(bodies.velocity, axis=1) > MOVING_MPS
-        counts &= np.arange(len(bodies.xy)) != own
+        counts &= np.arange(len(bodies.xy)) != row
         ahead = bodies.velocity[counts, None] * CROSSED_S[:, None]
         places = bodies.xy[counts, None] + ahead  # (K, T, 2)
         apart = places[:, :, None] - crossed[:, :2]  # (K, T, N, 2)

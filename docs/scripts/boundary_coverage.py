@@ -16,7 +16,8 @@ from evaluators.statistics.boundary_area import AREA_STEPS, Point, area_of, next
 
 POLICIES = 300
 VALUES = {point: 4.0 + 10.0 * point / STEPS for point in range(STEPS + 1)}
-LINE, AREA = (STEPS + 1, 1.0, 6.0, 11.0), ((AREA_STEPS + 1) ** 2, 0.05, 0.15, 0.35)
+LINE = (STEPS + 1, 1.0, 6.0, 11.0)
+AREA = ((AREA_STEPS + 1) ** 2, 0.05, 0.15, 0.35)
 
 
 def along(boundary: float, noise: float, rng: np.random.Generator) -> tuple[Interval | str, int]:
@@ -50,11 +51,13 @@ def main() -> None:
             rng = stream("boundary", policy, f"coverage/{spread}/{noise}/{seeds}")
             truth = rng.uniform(low, high)
             true_difference = scale * rng.uniform(-1.0, 1.0)
-            own = truth + spread * rng.standard_normal(seeds)
-            other = own - true_difference + 0.3 * spread * rng.standard_normal(seeds)
-            found = [[search(one, noise, rng) for one in side] for side in (own, other)]
-            driven += sum(count for _, count in found[0])
-            brackets, others = ([x for x, _ in side if isinstance(x, Interval)] for side in found)
+            first_arm = truth + spread * rng.standard_normal(seeds)
+            other = first_arm - true_difference + 0.3 * spread * rng.standard_normal(seeds)
+            searches = [[search(one, noise, rng) for one in side] for side in (first_arm, other)]
+            driven += sum(count for _, count in searches[0])
+            brackets, others = (
+                [x for x, _ in side if isinstance(x, Interval)] for side in searches
+            )
             if len(brackets) < seeds or len(others) < seeds:
                 continue
             estimate, difference = line.boundary_of(brackets), line.difference_of(brackets, others)

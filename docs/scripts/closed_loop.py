@@ -40,12 +40,12 @@ def read_run(run: Path) -> tuple[str, Entry]:
         rows.astype({EVENT: float}).groupby(["family", "renderer"])[EVENT].agg(["sum", "count"])
     )
     entry: Entry = {key + "s": rows[key].nunique() for key in ("scene", "seed")}
-    for kind, of, names, keys in (
+    for kind, section, names, keys in (
         ("means", "metrics", RENDERERS, ("mean", "ci95", "ci95_clustered")),
         ("minus", "paired", OTHERS, ("diff", "ci95", "p_value")),
     ):
         entry[kind] = {
-            metric: {name: list(np.hstack([summary[of][name][metric][key] for key in keys]))
+            metric: {name: list(np.hstack([summary[section][name][metric][key] for key in keys]))
                      for name in names} for metric in UNITS
         }  # fmt: skip
     entry["events"] = {
@@ -93,16 +93,16 @@ def over_families(events: Entry) -> tuple[float, float, str, float]:
     n = len(change)
     variance = n / (n - 1) * np.sum((change - mean * rollouts) ** 2) / rollouts.sum() ** 2
     half = stdtrit(n - 1, 0.975) * np.sqrt(variance)
-    rest = (change.sum() - change) / (rollouts.sum() - rollouts)
-    most = int(np.argmax(np.abs(rest - mean)))
-    return 100 * (mean - half), 100 * (mean + half), list(events)[most], 100 * rest[most]
+    without_family = (change.sum() - change) / (rollouts.sum() - rollouts)
+    most = int(np.argmax(np.abs(without_family - mean)))
+    return 100 * (mean - half), 100 * (mean + half), list(events)[most], 100 * without_family[most]
 
 
 def sentence(entry: Entry, length: str) -> str:
     """Return README's sentence."""
     share = {name: f"{100 * cell[0]:.1f} %" for name, cell in entry["means"][EVENT].items()}
     diff, low, high = (f"{100 * bound:+.1f}" for bound in entry["minus"][EVENT][FIXED][:3])
-    lowest, highest, family, rest = over_families(entry["events"])
+    lowest, highest, family, without_family = over_families(entry["events"])
     scenes, seeds, families = entry["scenes"], entry["seeds"], len(entry["events"])
     return (
         f"In {scenes * seeds} rollouts of the policy `{POLICY}`, {length} ({scenes} scenes of the "
@@ -110,7 +110,7 @@ def sentence(entry: Entry, length: str) -> str:
         f"road or is at fault in a contact is {share[BASELINE]} behind `{BASELINE}`, "
         f"{share[FIXED]} behind `{FIXED}` and {share[TRUE]} behind `{TRUE}`. `{FIXED}` minus "
         f"`{BASELINE}`: {diff} points, 95 % interval {low} to {high} over scenes and {lowest:+.1f} "
-        f"to {highest:+.1f}\nover families; {rest:+.1f} points without the family that moves it "
+        f"to {highest:+.1f}\nover families; {without_family:+.1f} points without the family that moves it "
         f"most, {family} ([closed loop](docs/experiments/fixer-closed-loop.md)).\n"
     )
 

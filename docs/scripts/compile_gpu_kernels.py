@@ -48,8 +48,8 @@ def resources(kernel: Any, capability: int) -> str:
     with tempfile.NamedTemporaryFile(suffix=".cubin", buffering=0) as file:
         file.write(compiled.asm["cubin"])
         command = [str(tool), "--dump-resource-usage", file.name]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    (registers,), (stack,) = (re.findall(rf"{word}:(\d+)", said) for word in ("REG", "STACK"))
+        listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    (registers,), (stack,) = (re.findall(rf"{word}:(\d+)", listing) for word in ("REG", "STACK"))
     return f"registers {registers} stack {stack} "
 
 

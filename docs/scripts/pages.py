@@ -20,8 +20,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def replaced(text: str, block: str, content: str) -> str:
     """Replace what stands between a block's two comments."""
     pattern = rf"(<!-- begin {block}\b[^\n]*-->\n).*?(<!-- end {block} -->)"
-    text, found = re.subn(pattern, lambda match: match[1] + content + match[2], text, flags=re.S)
-    assert found == 1, f"the page has {found} blocks called {block}"
+    text, count = re.subn(pattern, lambda match: match[1] + content + match[2], text, flags=re.S)
+    assert count == 1, f"the page has {count} blocks called {block}"
     return text
 
 

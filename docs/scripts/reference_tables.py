@@ -53,9 +53,9 @@ def verb_section(name: str, command: Any) -> str:
         is_newest = meaning == "A run folder; default: the newest."  # said once, above
         if getattr(option, "hidden", False) or set(names) & set(EVERY_VERB) or is_newest:
             continue
-        shown = ", ".join(f"`{name}`" for name in names)
+        written_names = ", ".join(f"`{name}`" for name in names)
         again = "..." if meaning.endswith(" Repeatable.") else ""
-        rows.append((shown + again, meaning.removesuffix(" Repeatable.")))
+        rows.append((written_names + again, meaning.removesuffix(" Repeatable.")))
     text = " ".join((command.help or "").partition("\n\n")[0].split())
     options = "\n" + table(("option", "meaning"), rows) if rows else ""
     return f"## {name}\n{text}\n{options}"
@@ -135,16 +135,16 @@ def key_tables() -> str:
     stand in the table of the first one.
     """
     sections = []
-    shown: dict[str, set[tuple[str, ...]]] = {}
-    for where, model in models().items():
-        owner, _, kind = where.partition(" kind: ")
+    printed_rows: dict[str, set[tuple[str, ...]]] = {}
+    for section, model in models().items():
+        owner, _, kind = section.partition(" kind: ")
         rows = [key_row(name, field) for name, field in model.model_fields.items()
                 if not (kind and name == "kind")]  # fmt: skip
-        new = [row for row in rows if row not in shown.setdefault(owner, set())]
-        shown[owner] |= set(rows)
+        new = [row for row in rows if row not in printed_rows.setdefault(owner, set())]
+        printed_rows[owner] |= set(rows)
         summary = " ".join((model.__doc__ or "").partition("\n\n")[0].split())
         keys = "\n" + table(("key", "type", "default", "meaning"), new) if new else ""
-        sections.append(f"## {f'`{where}`' if where else 'Top level'}\n{summary}\n{keys}")
+        sections.append(f"## {f'`{section}`' if section else 'Top level'}\n{summary}\n{keys}")
     return "\n".join(sections)
 
 

@@ -22,7 +22,8 @@ from alpasim_plugin.runs.gpu_check import frame_request
 from evaluators.metrics.outcomes import OUTCOMES
 from evaluators.statistics.bounded import rate_interval
 
-RENDERERS, POLICIES = ("clean", "3dgs", "onefixer"), ("lane-camera", "learned")
+RENDERERS = ("clean", "3dgs", "onefixer")
+POLICIES = ("lane-camera", "learned")
 STREETS = ("smoke/straight", "smoke/curve", "smoke/lead_car")
 SCENES = [{"path": STREETS[i % 3], "seeds": [1 + i // 3]} for i in range(20)]
 SHARES = range(0, 20, 5)  # first scene of each: a table may be read when a part is driven
@@ -51,13 +52,13 @@ def drive(out: Path, renderer: str, first: int, weather: str) -> None:
 def counted(out: Path, renderer: str, policy: str, weather: str) -> str:
     """Return how many rollouts had no event, with the interval of their share in percent."""
     runs = [Run.read_so_far(one) for one in (out / renderer / weather).glob("*")]
-    mine = [one for run in runs for one in run.rollouts if one.policy == policy]
-    clear = [float(not any(one.metrics.get(name) for name in OUTCOMES)) for one in mine]
+    rollouts = [one for run in runs for one in run.rollouts if one.policy == policy]
+    clear = [float(not any(one.metrics.get(name) for name in OUTCOMES)) for one in rollouts]
     if len(clear) < 2:
         return "not driven"
     bounds = rate_interval(np.array(clear)).bounds or []
-    shown = " to ".join(f"{100 * bound:.0f}" for bound in bounds)
-    return f"{sum(clear):.0f} of {len(clear)} ({shown} %)"
+    interval = " to ".join(f"{100 * bound:.0f}" for bound in bounds)
+    return f"{sum(clear):.0f} of {len(clear)} ({interval} %)"
 
 
 def contrasts(weather: str) -> Iterator[float]:

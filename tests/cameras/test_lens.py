@@ -65,7 +65,7 @@ def test_the_ray_of_a_pixel_is_shown_at_that_pixel(lens):
     spec = camera(lens)
     rays = rays_of(spec)
     pixel = np.stack(np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5), axis=-1).reshape(-1, 2)
-    seen = rays.seen & (np.linalg.norm(pixel - spec.K[:2, 2], axis=1) > 1)
+    seen = rays.visible & (np.linalg.norm(pixel - spec.K[:2, 2], axis=1) > 1)
     assert seen.sum() > 0.8 * len(seen)
     assert_allclose(by_equations(spec, rays.ray[seen]), pixel[seen], atol=0.06)
     shown, good = pixels_of(spec, rays.ray[seen])
@@ -90,14 +90,14 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
     out = joined("lens", sides, frames)
     rays = rays_of(spec)
     off = np.abs(out.rgb.reshape(-1, 3) - colours(rays.ray)).max(axis=1)
-    assert (off[rays.seen] <= 2).mean() > 0.995
-    assert (out.rgb.reshape(-1, 3)[~rays.seen] == 0).all()
-    assert_array_equal(out.alpha.ravel() > 0.5, ~rays.seen)
+    assert (off[rays.visible] <= 2).mean() > 0.995
+    assert (out.rgb.reshape(-1, 3)[~rays.visible] == 0).all()
+    assert_array_equal(out.alpha.ravel() > 0.5, ~rays.visible)
     (reference,) = out.references
     holds = reference[..., 3] > 252
     assert np.abs(reference[..., :3].astype(int) - out.rgb)[holds].max() <= 3
     assert (holds == (reference[..., 3] > 0)).mean() > 0.95
-    assert rays.seen[holds.ravel()].all()
+    assert rays.visible[holds.ravel()].all()
     assert holds.mean() > 0.2
     assert len(sides) == (3 if lens.kind == "opencv" else 5)
     assert rays.widest_rad > np.deg2rad(40 if lens.kind == "opencv" else 99)

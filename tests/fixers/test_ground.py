@@ -103,7 +103,7 @@ def test_a_box_around_or_beside_the_camera_is_seen_where_it_is():
     def seen(y, width):
         place = {"car": se2(0.0, y, 0.0, 0.75)}
         box = {"car": Box(20.0, width, 9.0)}
-        return on_boxes((HEIGHT, WIDTH), place_boxes((HEIGHT, WIDTH), K, FORWARD, place, box).seen)
+        return on_boxes((HEIGHT, WIDTH), place_boxes((HEIGHT, WIDTH), K, FORWARD, place, box).boxes)
 
     assert seen(0.0, 2.0).all()
     beside = seen(2.0, 2.0)  # from 1 m to the left on, to 10 m ahead

@@ -53,7 +53,7 @@ def test_a_frame_shows_the_world_in_the_directions_of_the_lens(straight_road):
     rays = rays_of(camera)
     unit = rays.ray / np.linalg.norm(rays.ray, axis=1, keepdims=True)
     off = np.abs(second.rgb.reshape(-1, 3) - (127.5 + 127 * unit @ T[1, :3, :3].T)).max(axis=1)
-    assert (off[rays.seen] <= 2).mean() > 0.995
+    assert (off[rays.visible] <= 2).mean() > 0.995
     names = [one.name for one in cover.pinholes(camera)]
     sides = ["fish.ahead", "fish.left", "fish.right", "fish.up", "fish.down"]
     assert sorted(names) == sorted(sides)

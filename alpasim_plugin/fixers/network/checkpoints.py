@@ -24,7 +24,9 @@ RECOMPUTED = (
 )
 INFIXES = ("_checkpoint_wrapped_module.", "_orig_mod.")  # of wrappers around layers
 WRAPPER = "module."  # of data-parallel training, before all keys
-OWN, AVERAGED = "net.", "net_ema."  # where a training checkpoint holds both, the first is read
+# Where a training checkpoint holds both, the first is read
+OWN = "net."
+AVERAGED = "net_ema."
 LISTED = 8  # keys named in one error message; the rest is counted
 ZIP_MAGIC = b"PK\x03\x04"
 PICKLE_MAGIC = b"\x80"

@@ -35,7 +35,8 @@ from alpasim_plugin.fixers.network.pixel_layers import (
     pixels,
 )
 
-CELL, DETAIL = 4, 2  # pixels of a cell's side in the U-Net and in the detail path
+CELL = 4  # pixels of a cell's side in the U-Net
+DETAIL = 2  # the same in the detail path
 FINER_PX = 4  # pixels of the side of a cell in which large images are weighed
 HALF = 127.5  # grey levels from 0 to 1 on the scale of [-1, 1]
 # of a reference: colour minus that of the render where the reference holds, and where it holds

@@ -30,9 +30,10 @@ POLE_HEIGHT_M = 3.0  # of poles given as one point
 CROSSWALK_BIAS_M = -0.4
 # Corners of a unit box: bit 2 is +x, bit 1 is +y, bit 0 is +z.
 CORNERS = np.array([[(i >> 2 & 1) - 0.5, (i >> 1 & 1) - 0.5, (i & 1) - 0.5] for i in range(8)])
+# Wound to the left from outside
 FACES = np.array(
     [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-)  # wound to the left from outside
+)
 TRIANGLES = np.concatenate([FACES[:, [0, 1, 2]], FACES[:, [0, 2, 3]]])  # (12, 3)
 EDGES = np.array(
     [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]]
@@ -242,7 +243,6 @@ def triangulate(name: str, ring: F64) -> F64:
         raise InputError(f"{name}: an outline of {len(ring)} points", "give at least three corners")
     outline = shapely.make_valid(shapely.Polygon(ring))
     parts = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
-    corners = shapely.get_coordinates(parts, include_z=True).reshape(
-        -1, 4, 3
-    )  # closed: the last corner repeats the first
+    # Closed: the last corner repeats the first
+    corners = shapely.get_coordinates(parts, include_z=True).reshape(-1, 4, 3)
     return corners[:, :3]

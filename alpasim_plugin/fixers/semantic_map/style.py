@@ -15,7 +15,9 @@ POLE_PX = 5.0
 BOX_EDGE_PX = 4.0
 DEPTH_MAX_M = 200.0  # colours and widths fade to nothing here
 NEAR_M = 0.1  # everything nearer along the optical axis is cut off
-DASH_M, GAP_M = 3.0, 9.0  # repeated from the first point of a line
+# Repeated from the first point of a line
+DASH_M = 3.0
+GAP_M = 9.0
 DOUBLE_OFFSET_M = 0.1  # each line of a pair lies this far from the middle
 # Edges of boxes are moved this far towards the camera, so that faces do not hide them.
 EDGE_BIAS_M = 0.1

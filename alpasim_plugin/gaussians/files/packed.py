@@ -154,12 +154,12 @@ def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) 
         )
     need = -(-len(rows) // CHUNK)
     if missing or len(chunks) < need:
-        found = (
+        problem = (
             f"missing properties {missing}"
             if missing
             else f"{len(chunks)} chunks where {need} are needed"
         )
-        raise InputError(f"{header.path}: {found}", "export the file again")
+        raise InputError(f"{header.path}: {problem}", "export the file again")
 
 
 _ROW = np.dtype(
@@ -197,8 +197,11 @@ _GZIP = b"\x1f\x8b"
 _COLOUR_SCALE = 0.15
 _EXPORT_AGAIN = "copy or export the file again"
 
-ANTIALIASED, EXTENDED = 1, 2  # flags of a header
-ORBIT, AXES = 0xADBE0002, 0xADBE0003  # extensions: limits of a viewer's camera; where axes point
+# Flags of a header
+ANTIALIASED = 1
+EXTENDED = 2
+ORBIT = 0xADBE0002  # extensions: limits of a viewer's camera
+AXES = 0xADBE0003  # where axes point
 MOST_EXTENDED = 1 << 16  # bytes of extensions
 # Axes by the number in the extension: where x, y and z point.
 SYSTEMS = (
@@ -289,13 +292,13 @@ def read_spz(path: Path | str) -> GaussianArrays:
 
 def _stated_axes(path: Path, data: bytes) -> str:
     """Return the axes that extensions state: records of a type, a length and as many bytes."""
-    at = 0
+    offset = 0
     system = SYSTEMS[0]
-    while at < len(data):
+    while offset < len(data):
         with parsing(path, _EXPORT_AGAIN, "damaged extensions"):
-            kind, size = struct.unpack_from("<II", data, at)
+            kind, size = struct.unpack_from("<II", data, offset)
             if kind == AXES:
-                system = SYSTEMS[struct.unpack_from("<I", data, at + 8)[0]]
+                system = SYSTEMS[struct.unpack_from("<I", data, offset + 8)[0]]
         if system in CONTRADICTORY:
             raise _failure(
                 path,
@@ -304,7 +307,7 @@ def _stated_axes(path: Path, data: bytes) -> str:
             )
         if kind not in (AXES, ORBIT):
             raise _failure(path, f"extension {kind:#010x} of unknown meaning", "export it without")
-        at += 8 + size
+        offset += 8 + size
     return system
 
 
@@ -326,12 +329,12 @@ def in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
         orders = [m for degree in range(5) for m in range(-degree, degree + 1)]
         odd = np.array([(abs(m) + (m < 0)) % 2 for m in orders])[: sh.shape[1]]
         sh = sh * (1 - 2 * odd)[:, None]
-    drawn = rotate_sh(sh[:, : SH_SIZES[-1]].astype(np.float64), M)
+    rotated_sh = rotate_sh(sh[:, : SH_SIZES[-1]].astype(np.float64), M)
     turned = quat_multiply(quat_from_matrix(M), quats.astype(np.float64))
     return arrays._replace(
         means=(means @ M.T).astype(np.float32),
         quats=turned.astype(np.float32),
-        sh=np.concatenate([drawn, sh[:, SH_SIZES[-1] :]], axis=1).astype(np.float32),
+        sh=np.concatenate([rotated_sh, sh[:, SH_SIZES[-1] :]], axis=1).astype(np.float32),
     )
 
 
@@ -398,5 +401,5 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
     return SpzHeader(version, count, degree, bits, flags)
 
 
-def _failure(path: Path, found: str, do_this: str) -> InputError:
-    return InputError(f"{path}: {found}", do_this)
+def _failure(path: Path, problem: str, do_this: str) -> InputError:
+    return InputError(f"{path}: {problem}", do_this)

@@ -87,9 +87,9 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
         linear = beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]
         is_harmless = beside.name.startswith("vertex") or beside.name in _BESIDE
         if linear or (beside.count and not is_harmless):
-            found = "linear colours" if linear else f"{beside.count} rows of unknown meaning"
+            problem = "linear colours" if linear else f"{beside.count} rows of unknown meaning"
             raise InputError(
-                f"{header.path}, element {beside.name!r}: {found}",
+                f"{header.path}, element {beside.name!r}: {problem}",
                 "export a plain 3DGS model, with colours in sRGB",
             )
     rows = read_ply_element(header, chosen.name)
@@ -258,10 +258,10 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> tuple[int, list
             f"{header.path}, element {element.name!r}: missing properties {missing}",
             "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
-    known = {*_REQUIRED, *_SCALES, "filter_3D", "filter_3d"}
+    usual_properties = {*_REQUIRED, *_SCALES, "filter_3D", "filter_3d"}
     strange = sorted(
         name
-        for name in have - known
+        for name in have - usual_properties
         if not name.startswith("f_rest_") and _HARMLESS.fullmatch(name) is None
     )
     unknown = [name for name in strange if _neutral_of(name) is None]
@@ -460,10 +460,10 @@ def _text_rows(
     header: PlyHeader, element: PlyElement, dtype: np.dtype[np.void], start: int, first: int
 ) -> NDArray[np.void]:
     lines = read_bytes(header.path)[start:].splitlines()[first : first + element.count]
-    where = f"{header.path}, element {element.name!r}"
+    location = f"{header.path}, element {element.name!r}"
     if len(lines) < element.count:
-        raise InputError(f"{where}: {len(lines)} of {element.count} rows", _EXPORT_AGAIN)
-    with parsing(where, _EXPORT_AGAIN, "rows that are not of numbers"):
+        raise InputError(f"{location}: {len(lines)} of {element.count} rows", _EXPORT_AGAIN)
+    with parsing(location, _EXPORT_AGAIN, "rows that are not of numbers"):
         table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
         rows = np.empty(element.count, dtype)
         for name, column in zip(element.properties, table.T, strict=True):

@@ -97,27 +97,29 @@ def read_sog(path: Path) -> GaussianArrays:
         return _read(lambda name: archive.read(names[name]), path)
 
 
-def _read(get: Get, where: Path) -> GaussianArrays:
-    document = parse_json(get(META), where)
-    meta = as_shape(_Meta, document, where, DO_THIS)
+def _read(get: Get, location: Path) -> GaussianArrays:
+    document = parse_json(get(META), location)
+    meta = as_shape(_Meta, document, location, DO_THIS)
     if meta["version"] != 2:
-        raise InputError(f"{where}: version {meta['version']}", DO_THIS)
-    known = SOG.names() | SOG.names(harmless=True)
-    unknown = sorted(key for key in document if field_name(META, key) not in known)
+        raise InputError(f"{location}: version {meta['version']}", DO_THIS)
+    known_fields = SOG.names() | SOG.names(harmless=True)
+    unknown = sorted(key for key in document if field_name(META, key) not in known_fields)
     if unknown:
         raise InputError(
-            f"{where}: keys that may change what is drawn: {some_of(unknown)}", DO_THIS
+            f"{location}: keys that may change what is drawn: {some_of(unknown)}", DO_THIS
         )
     model = document.get("model", "default")
     if model not in ("default", "antialiased", "2dgs"):
-        raise InputError(f"{where}: a model {model!r}", DO_THIS)
+        raise InputError(f"{location}: a model {model!r}", DO_THIS)
     n = meta["count"]
-    GAUSSIANS.check(n, where)
+    GAUSSIANS.check(n, location)
 
     def plane(name: str, least: int) -> U8:
-        pixels = _plane(get(name), f"{where}, {name}").reshape(-1, 4)
+        pixels = _plane(get(name), f"{location}, {name}").reshape(-1, 4)
         if len(pixels) < least:
-            raise InputError(f"{where}, {name}: {len(pixels)} pixels for {least} values", DO_THIS)
+            raise InputError(
+                f"{location}, {name}: {len(pixels)} pixels for {least} values", DO_THIS
+            )
         return pixels[:least]
 
     low, high = (plane(name, n)[:, :3].astype(np.float64) for name in meta["means"]["files"])
@@ -141,16 +143,16 @@ def _read(get: Get, where: Path) -> GaussianArrays:
     return GaussianArrays(means, quats, scales, opacities, sh, antialias_px2=antialias_px2)
 
 
-def _plane(data: bytes, where: str) -> U8:
+def _plane(data: bytes, location: str) -> U8:
     """Return a plane as RGBA ``(H, W, 4)``, after looking at the size that its header claims."""
     size = _webp_size(data)
     if size is None:
-        raise InputError(f"{where}: {len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
-    STORED_PIXELS.check(size[0] * size[1], where)
-    with parsing(where, DO_THIS, "no readable WebP"):
+        raise InputError(f"{location}: {len(data)} bytes beginning {data[:4]!r}, no WebP", DO_THIS)
+    STORED_PIXELS.check(size[0] * size[1], location)
+    with parsing(location, DO_THIS, "no readable WebP"):
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3:
-        raise InputError(f"{where}: a plane that does not decode", DO_THIS)
+        raise InputError(f"{location}: a plane that does not decode", DO_THIS)
     code = cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
     return cv2.cvtColor(image, code)
 

@@ -33,7 +33,8 @@ GAPS = (-3, -2, -1, 1, 2, 3)
 STRIDE = 2  # every such pixel is measured, in rows and columns
 RESIDUAL_PX = 0.7  # between flow and what the depth predicts
 LEAST_SUPPORT = 3  # neighbours that agree; two at the ends of the way
-NOISE_PX, LARGEST_SPREAD = 0.25, 0.10  # of flow; of a depth, as a share of it
+NOISE_PX = 0.25  # of flow
+LARGEST_SPREAD = 0.10  # of a depth, as a share of it
 NEAR_M = 0.5
 FAR_M = 300.0
 LEAST_STEP = 1.2  # levels of brightness from pixel to pixel, within two pixels
@@ -66,11 +67,11 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
         if guess is None or len(near) < 2:
             out.append(np.zeros(view.rgb.shape[:2], np.float32))
             continue
-        seen = [
-            _Seen.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
+        neighbours = [
+            _NeighbourFlow.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
             for j in near
         ]
-        out.append(_depth(view, seen, guess))
+        out.append(_depth(view, neighbours, guess))
     return [_agreed(views, out, i) for i in range(len(views))]
 
 
@@ -85,24 +86,30 @@ def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int
     good = (placed.error_px[rows] < 1.5) & (local > NEAR_M)
     if good.sum() < FEWEST_POINTS:
         return None
-    at = tracks.at[rows][good]
+    pixels = tracks.pixel[rows][good]
     q = 1 / local[good]
     v, u = np.mgrid[0 : camera.height : 4, 0 : camera.width : 4] + 0.5
-    inside = scipy.interpolate.LinearNDInterpolator(at, q)(u, v)
-    outside = scipy.interpolate.NearestNDInterpolator(at, q)(u, v)
+    inside = scipy.interpolate.LinearNDInterpolator(pixels, q)(u, v)
+    outside = scipy.interpolate.NearestNDInterpolator(pixels, q)(u, v)
     coarse = np.where(np.isnan(inside), outside, inside).astype(np.float32)
     return cv2.resize(coarse, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """One neighbour: where it sees each measured pixel, and the terms of ``pi(a + q b)``, where
-    depth 1/q projects to.
+class _NeighbourFlow:
+    """The pixels of a neighbouring view that optical flow matches to the measured pixels.
+
+    Depth 1/q of a measured pixel projects to ``pi(a + q b)`` in the neighbour.
+
+    Attributes:
+        a, b: The terms of that projection.
+        uv: The matched pixel.
+        ok: Whether the match lies in the neighbour's image and before its camera.
     """
 
     a: F32  # (h, w, 3)
     b: F32  # (3,)
-    at: F32  # (h, w, 2) pixels
+    uv: F32  # (h, w, 2) pixels
     ok: Bool  # (h, w)
 
     @classmethod
@@ -111,10 +118,10 @@ class _Seen:
         camera: PinholeCamera,
         other: PinholeCamera,
         grey: U8,
-        there: U8,
+        other_grey: U8,
         guess: F32,
         flow: cv2.DISOpticalFlow,
-    ) -> _Seen:
+    ) -> _NeighbourFlow:
         """Warp the neighbour by the guess, find the rest by flow."""
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float32) + np.float32(0.5)
         T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
@@ -122,45 +129,45 @@ class _Seen:
         b = (other.K @ T[:3, 3]).astype(np.float32)
         a = u[..., None] * H[:, 0] + v[..., None] * H[:, 1] + H[:, 2]
         p = a + guess[..., None] * b
-        at = p[..., :2] / np.maximum(p[..., 2:], 1e-3)
+        uv = p[..., :2] / np.maximum(p[..., 2:], 1e-3)
         warped = cv2.remap(
-            there,
-            at[..., 0] - 0.5,
-            at[..., 1] - 0.5,
+            other_grey,
+            uv[..., 0] - 0.5,
+            uv[..., 1] - 0.5,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        rest = flow.calc(grey, warped, None)
-        x = (u - 0.5 + rest[..., 0])[::STRIDE, ::STRIDE]
-        y = (v - 0.5 + rest[..., 1])[::STRIDE, ::STRIDE]
-        at = cv2.remap(at, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        h, w = there.shape[:2]
+        residual_flow = flow.calc(grey, warped, None)
+        x = (u - 0.5 + residual_flow[..., 0])[::STRIDE, ::STRIDE]
+        y = (v - 0.5 + residual_flow[..., 1])[::STRIDE, ::STRIDE]
+        uv = cv2.remap(uv, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        h, w = other_grey.shape[:2]
         ok = (
-            (at[..., 0] >= 0)
-            & (at[..., 1] >= 0)
-            & (at[..., 0] <= w)
-            & (at[..., 1] <= h)
+            (uv[..., 0] >= 0)
+            & (uv[..., 1] >= 0)
+            & (uv[..., 0] <= w)
+            & (uv[..., 1] <= h)
             & (p[::STRIDE, ::STRIDE, 2] > 0.1)
         )
-        return cls(a[::STRIDE, ::STRIDE], b, at, ok)
+        return cls(a[::STRIDE, ::STRIDE], b, uv, ok)
 
     def error(self, q: F32) -> tuple[F32, F32]:
         """Return projection minus flow ``(h, w, 2)`` and its derivative by q."""
         p = self.a + q[..., None] * self.b
         z = np.maximum(p[..., 2:], 1e-3)
         uv = p[..., :2] / z
-        return np.asarray(uv - self.at, np.float32), np.asarray(
+        return np.asarray(uv - self.uv, np.float32), np.asarray(
             (self.b[:2] - uv * self.b[2]) / z, np.float32
         )
 
 
-def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
+def _depth(view: PosedView, neighbours: Sequence[_NeighbourFlow], guess: F32) -> F32:
     """Find each measured pixel's inverse depth from where the neighbours see it, and how far they agree."""
     q = guess[::STRIDE, ::STRIDE].copy()
     for _ in range(ROUNDS):
         H = np.full(q.shape, 1e-9, np.float32)
         g = np.zeros_like(q)
-        for other in seen:
+        for other in neighbours:
             e, J = other.error(q)
             weight = other.ok / np.maximum(np.linalg.norm(e, axis=2), 0.5)
             H += weight * (J * J).sum(axis=2)
@@ -168,36 +175,39 @@ def _depth(view: PosedView, seen: Sequence[_Seen], guess: F32) -> F32:
         q = np.clip(q - g / H, 0.0, 1 / NEAR_M).astype(np.float32)
     support = np.zeros(q.shape, np.int32)
     information = np.zeros_like(q)
-    for other in seen:
+    for other in neighbours:
         e, J = other.error(q)
         good = other.ok & (np.linalg.norm(e, axis=2) < RESIDUAL_PX)
         support += good
         information += good * (J * J).sum(axis=2)
     sigma = NOISE_PX / np.sqrt(np.maximum(information, 1e-12))  # of the inverse depth
-    known = (
-        (support >= min(LEAST_SUPPORT, len(seen) - 1))
+    confident = (
+        (support >= min(LEAST_SUPPORT, len(neighbours) - 1))
         & (q > 1 / FAR_M)
         & (sigma < LARGEST_SPREAD * q)
     )
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
-    known &= (cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)[::STRIDE, ::STRIDE]
+    confident &= (cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)[::STRIDE, ::STRIDE]
     if view.mask is not None:
-        known &= view.mask[::STRIDE, ::STRIDE]
+        confident &= view.mask[::STRIDE, ::STRIDE]
     depth = np.zeros(view.rgb.shape[:2], np.float32)
-    depth[::STRIDE, ::STRIDE] = np.where(known, 1 / np.maximum(q, 1e-6), 0)
+    depth[::STRIDE, ::STRIDE] = np.where(confident, 1 / np.maximum(q, 1e-6), 0)
     return depth
 
 
 def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
-    """Keep what the depth map of a neighbour confirms, within `AGREE`, or none can look at."""
+    """Return the depth map without values that neighbours see and none confirms within `AGREE`.
+
+    A pixel that no neighbour's depth map covers keeps its value.
+    """
     depth = maps[i]
     rows, columns = np.nonzero(depth)
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
     local = camera.unprojected(rows, columns, z)
     confirmed = np.zeros(len(z), bool)
-    asked = np.zeros(len(z), bool)
+    covered = np.zeros(len(z), bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
             other = views[i + gap].camera
@@ -210,12 +220,14 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
             inside = (
                 (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])
             )
-            found = np.zeros(len(ahead))
-            found[inside] = small[y[inside], x[inside]]
-            confirmed |= (found > 0) & (np.abs(found - p[:, 2]) < AGREE * p[:, 2])
-            asked |= found > 0
+            neighbour_depth = np.zeros(len(ahead))
+            neighbour_depth[inside] = small[y[inside], x[inside]]
+            confirmed |= (neighbour_depth > 0) & (
+                np.abs(neighbour_depth - p[:, 2]) < AGREE * p[:, 2]
+            )
+            covered |= neighbour_depth > 0
     keep = np.zeros(depth.shape, bool)
-    keep[rows, columns] = confirmed | ~asked
+    keep[rows, columns] = confirmed | ~covered
     return np.where(keep, depth, 0)
 
 
@@ -234,13 +246,13 @@ def sky_masks(views: Sequence[PosedView]) -> list[Bool]:
         views: With depth where it is known: a region that has one is no sky.
     """
     regions = [_regions(view) for view in views]
-    seen = [
+    sky_colours = [
         view.rgb[region > 0] for view, region in zip(views, regions, strict=True) if region.any()
     ]
-    if not seen:
+    if not sky_colours:
         return [region > 0 for region in regions]
     # Every photograph counts alike, so that one wall that fills an image does not decide.
-    usual = np.median([np.median(colours, axis=0) for colours in seen], axis=0)
+    usual = np.median([np.median(colours, axis=0) for colours in sky_colours], axis=0)
     return [_of_colour(view, region, usual) for view, region in zip(views, regions, strict=True)]
 
 

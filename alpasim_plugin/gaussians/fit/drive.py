@@ -24,9 +24,8 @@ from alpasim_plugin.gaussians.fit.views import PosedView, camera_of
 
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
-Report = Callable[
-    [str, int, int, Mapping[str, float]], None
-]  # stage, done, all, numbers of the fit
+# Stage, done, all, numbers of the fit
+Report = Callable[[str, int, int, Mapping[str, float]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +86,11 @@ def fit_drive(
         )
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     train, guesses = prepared_views(views, tell)
-    seen = {name for view in train for name in view.actors}
-    shown = {name: box for name, box in (boxes or {}).items() if name in seen}
+    actors_in_view = {name for view in train for name in view.actors}
+    boxes_in_view = {name: box for name, box in (boxes or {}).items() if name in actors_in_view}
     start = Start(
         _start(train, guesses, points, recipe, scene_id),
-        start_in_boxes(shown, recipe.actor_points, scene_id, recipe.seed),
+        start_in_boxes(boxes_in_view, recipe.actor_points, scene_id, recipe.seed),
     )
     model = fit(
         train,
@@ -125,10 +124,10 @@ def prepared_views(
     cameras = {view.camera_name for view in views}
     for number, camera in enumerate(sorted(cameras)):
         tell("measuring depth, sky and exposure", number, len(cameras), {})
-        mine = sorted(
+        camera_views = sorted(
             (view for view in views if view.camera_name == camera), key=lambda view: view.name
         )
-        done, guess = _of_one_camera(mine)
+        done, guess = _of_one_camera(camera_views)
         ordered += done
         guesses += guess
     tell("measuring depth, sky and exposure", len(cameras), len(cameras), {})
@@ -183,7 +182,7 @@ def _start(
             [0.0 if view.depth is None else (view.depth > 0).mean() * STRIDE**2 for view in views]
         )
     )
-    given = [] if points is None else [points]
+    point_sets = [] if points is None else [points]
     if share < LEAST_MEASURED:
         if points is None:
             raise InputError(
@@ -206,7 +205,7 @@ def _start(
     return GaussianCloud.concatenate(
         [
             start_from_maps(views, more, recipe.points, scene_id, recipe.seed, recipe.start_size),
-            *given,
+            *point_sets,
         ]
     )
 

@@ -22,9 +22,8 @@ from alpasim_plugin.core.types import F32, F64, I64, U8
 from alpasim_plugin.gaussians.fit.tracks import Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-FISHEYE_HALF_VIEW_RAD = np.radians(
-    50.0
-)  # of a fisheye's pinhole image, from its middle to a side: beyond, pixels are only stretched
+# Of a fisheye's pinhole image, from its middle to a side: beyond, pixels are only stretched
+FISHEYE_HALF_VIEW_RAD = np.radians(50.0)
 FROM_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from pixel centres
 
 
@@ -46,7 +45,7 @@ class Lens:
     distortion: F64 = field(default_factory=lambda: np.zeros(5))
     model: Literal["opencv", "fisheye"] = "opencv"
 
-    def check(self, where: str, do_this: str) -> Lens:
+    def check(self, location: str, do_this: str) -> Lens:
         """Return it, or refuse numbers that are no lens.
 
         Raises:
@@ -54,9 +53,9 @@ class Lens:
         """
         finite = np.isfinite([*self.K.ravel(), *self.distortion]).all()
         if not finite or min(self.K[0, 0], self.K[1, 1]) <= 0 or min(self.width, self.height) < 1:
-            found = f"{self.width} x {self.height} pixels, focal lengths {self.K[0, 0]:g} and {self.K[1, 1]:g}"
+            sizes = f"{self.width} x {self.height} pixels, focal lengths {self.K[0, 0]:g} and {self.K[1, 1]:g}"
             raise InputError(
-                f"{where}: {found if finite else 'intrinsics that are not finite, or no focal length'}",
+                f"{location}: {sizes if finite else 'intrinsics that are not finite, or no focal length'}",
                 do_this,
             )
         return self
@@ -67,8 +66,8 @@ class Lens:
         return self.model == "fisheye" or bool(self.distortion.any())
 
     def straight_K(self) -> F64:
-        """Return the intrinsics of the image without distortion, of the same size: what it shows
-        is all in the photograph.
+        """Return the intrinsics of the image without distortion, of the same size: the
+        photograph covers all its pixels.
         """
         if not self.bends:
             return self.K
@@ -77,11 +76,11 @@ class Lens:
             # and stay in the photograph.
             x, y = self.K[:2, 2] - 0.5
             ends = [(0.0, y), (self.width - 1.0, y), (x, 0.0), (x, self.height - 1.0)]
-            seen = cv2.fisheye.undistortPoints(
+            tangents = cv2.fisheye.undistortPoints(
                 np.array([ends]), self.K - FROM_CORNER, self.distortion
-            )[0]  # tangents
+            )[0]
             most = np.tan(FISHEYE_HALF_VIEW_RAD)
-            sides = np.minimum(np.where(np.isfinite(seen), np.abs(seen), most), most)
+            sides = np.minimum(np.where(np.isfinite(tangents), np.abs(tangents), most), most)
             half = np.minimum(self.K[:2, 2], [self.width, self.height] - self.K[:2, 2])
             focal = float(
                 max(
@@ -120,8 +119,11 @@ class Lens:
 
 
 PATCH_PX = 7
-DARKEST, BRIGHTEST = 12.0, 245.0  # levels of a patch's mean that say something
-ROUNDS, SPREAD = 5, 0.05  # of robust weights; of a logarithm that counts fully
+# Levels of a patch's mean that is neither too dark nor too bright to measure.
+DARKEST = 12.0
+BRIGHTEST = 245.0
+ROUNDS = 5  # of robust weights
+SPREAD = 0.05  # of a logarithm that counts fully
 PULL = 1.0  # towards a gain of 1, in observations
 
 
@@ -131,12 +133,12 @@ def balances(views: Sequence[PosedView], tracks: Tracks) -> F64:
 
     A view without points keeps 1.
     """
-    shown = np.array(
-        [_patch(views[v].rgb, at) for v, at in zip(tracks.view.tolist(), tracks.at, strict=True)]
+    patch_colours = np.array(
+        [_patch(views[v].rgb, at) for v, at in zip(tracks.view.tolist(), tracks.pixel, strict=True)]
     ).reshape(-1, 3)
     out = np.ones((len(views), 3))
     for channel in range(3):
-        value = shown[:, channel]
+        value = patch_colours[:, channel]
         good = (value > DARKEST) & (value < BRIGHTEST)
         if good.any():
             out[:, channel] = np.exp(
@@ -179,8 +181,10 @@ def gain_near(camera: str, place: F64, cameras: Sequence[str], centres: F64, gai
     return np.asarray(weight @ gains[nearest] / weight.sum(), np.float32)
 
 
-def _patch(rgb: U8, at: F64) -> F64:
-    patch = cv2.getRectSubPix(rgb, (PATCH_PX, PATCH_PX), (float(at[0] - 0.5), float(at[1] - 0.5)))
+def _patch(rgb: U8, pixel: F64) -> F64:
+    patch = cv2.getRectSubPix(
+        rgb, (PATCH_PX, PATCH_PX), (float(pixel[0] - 0.5), float(pixel[1] - 0.5))
+    )
     return patch.reshape(-1, 3).mean(axis=0)
 
 
@@ -192,9 +196,9 @@ def _solved(value: F64, view: I64, point: I64, views: int, points: int) -> F64:
     weight = np.ones(len(value))
     for _ in range(ROUNDS):
         total = np.maximum(np.bincount(point, weight, points), 1e-12)
-        seen = scipy.sparse.csr_matrix((weight, (view, point)), shape=(views, points))
-        shared = seen @ scipy.sparse.diags(1 / total)
-        A = np.diag(np.bincount(view, weight, views) + PULL) - (shared @ seen.T).toarray()
+        observations = scipy.sparse.csr_matrix((weight, (view, point)), shape=(views, points))
+        shared = observations @ scipy.sparse.diags(1 / total)
+        A = np.diag(np.bincount(view, weight, views) + PULL) - (shared @ observations.T).toarray()
         b = np.bincount(view, weight * value, views) - shared @ np.bincount(
             point, weight * value, points
         )

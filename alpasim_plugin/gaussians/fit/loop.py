@@ -158,7 +158,8 @@ class SplatFit:
         self.step = 0
         small = [halved(view) for view in views] if recipe.coarse_share > 0 else []
         self.targets, self.coarse = (
-            [self._target(i, view) for i, view in enumerate(some)] for some in (views, small)
+            [self._target(i, view) for i, view in enumerate(sized_views)]
+            for sized_views in (views, small)
         )
         self.exposure = Exposure(np.array([view.gain for view in views]), self.device)
         self._facts = json.dumps(
@@ -201,7 +202,8 @@ class SplatFit:
         return {"loss": numbers["loss"], "psnr_db": psnr, "gaussians": len(self.model)}
 
     def _differentiate(self, target: _Target) -> dict[str, float]:
-        """Give the parameters the gradients of a view's loss, and count what the view pulls at.
+        """Give the parameters the gradients of a view's loss, and add up how strongly the view pulls at
+        each Gaussian.
 
         Returns:
             ``loss``, ``mse``, and the sum of each parameter's gradient by its name; all in one copy
@@ -229,11 +231,11 @@ class SplatFit:
             pixels, depth = target.depth
             off = depth / out.depth.view(-1)[pixels].clamp(min=0.1) - 1
             loss = loss + recipe.depth_weight * off.abs().clamp(max=DEPTH_CLIP).mean()
-        seen, weight = true_rows(out.on_screen)
-        shown = out.index[seen]
+        screen_rows, weight = true_rows(out.on_screen)
+        gaussian_rows = out.index[screen_rows]
         if recipe.needle_weight > 0:
             loss = loss + recipe.needle_weight * needles(
-                splats.log_scales[shown], weight, recipe.needle_ratio
+                splats.log_scales[gaussian_rows], weight, recipe.needle_ratio
             )
         loss.backward()  # type: ignore[no-untyped-call]
         off = rgb.detach().clamp(0, 1) - target.rgb
@@ -249,8 +251,8 @@ class SplatFit:
                 tensor.grad = None
             return self._differentiate(target)
         assert out.uv.grad is not None  # the backward pass has run
-        pull = out.uv.grad[seen].norm(dim=1) * (target.camera.width / 2)
-        self.gradients.add(rows[shown], pull, weight)
+        pull = out.uv.grad[screen_rows].norm(dim=1) * (target.camera.width / 2)
+        self.gradients.add(rows[gaussian_rows], pull, weight)
         return numbers
 
     def save(self) -> None:
@@ -313,8 +315,8 @@ class SplatFit:
         rgb = upload(view.rgb, device).float() / 255
         depth = None
         if view.depth is not None and self.recipe.depth_weight > 0:
-            known = np.flatnonzero(view.depth)
-            depth = upload(known, device), upload(view.depth.reshape(-1)[known], device)
+            measured = np.flatnonzero(view.depth)
+            depth = upload(measured, device), upload(view.depth.reshape(-1)[measured], device)
         return _Target(
             view.name,
             replace(camera, T_camera_world=T),
@@ -328,11 +330,11 @@ class SplatFit:
             index,
         )
 
-    def _stop(self, target: _Target, found: str) -> None:
+    def _stop(self, target: _Target, problem: str) -> None:
         if self.folder is not None:
             self.save()
         raise InfrastructureError(
-            f"view {target.name!r}, update {self.step}: {found}",
+            f"view {target.name!r}, update {self.step}: {problem}",
             "look at this view and its pose, or lower the recipe's rates; a folder that was given keeps the state before this update",
         )
 

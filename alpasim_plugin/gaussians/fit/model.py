@@ -199,11 +199,10 @@ def _harmonics(rotation: bytes, size: int) -> F64:
     return out
 
 
-BETA1, BETA2, EPS = (
-    0.9,
-    0.999,
-    1e-15,
-)  # epsilon as in the published 3DGS code: gradients of single Gaussians are tiny
+BETA1 = 0.9
+BETA2 = 0.999
+# As in the published 3DGS code: gradients of single Gaussians are tiny.
+EPS = 1e-15
 
 
 class RowAdam:

@@ -44,12 +44,14 @@ from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 FILE = "transforms.json"
+# The file's camera axes to ours
 AXES = {
     "opencv": np.eye(4),
     "opengl": np.diag([1.0, -1.0, -1.0, 1.0]),
-}  # the file's camera axes to ours
+}
 BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of OpenCV
-COEFFICIENTS = {  # of each lens model, in the order of OpenCV
+# Of each lens model, in the order of OpenCV
+COEFFICIENTS = {
     "OPENCV": BENDS[:5],
     "PINHOLE": BENDS[:5],
     "SIMPLE_PINHOLE": (),
@@ -85,7 +87,7 @@ class PosedPhotograph:
         file: Of the photograph.
         lens: Of its camera.
         T_world_camera: ``(4, 4)``, axes of OpenCV.
-        where: The place that names it, for messages.
+        location: The place that names it, for messages.
         t_us: When it was taken; None where that is unknown.
         camera: Name of its camera; None where that is unknown.
         more: What its file says besides.
@@ -95,22 +97,22 @@ class PosedPhotograph:
     file: Path
     lens: Lens
     T_world_camera: F64
-    where: str
+    location: str
     t_us: int | None
     camera: str | None
     more: Mapping[str, Any]
     data: memoryview | None = None
 
     def encoded(self) -> bytes:
-        """Return the encoded image after checking that it is whole and what its lens says, without
-        decoding it.
+        """Return the encoded image after checking, without decoding it, that it is whole and has
+        the size of its lens.
 
         Raises:
             InputError: The file is missing, cut off, of another size, too large, or not in grey or
                 RGB.
         """
         do = "check the path, which is relative to the folder, and the file"
-        name = f"{self.where}, {self.file}"
+        name = f"{self.location}, {self.file}"
         data = read_bytes(self.file, SOURCE_BYTES, do) if self.data is None else bytes(self.data)
         width, height = check_image(data, name, do)
         if (width, height) != (self.lens.width, self.lens.height):
@@ -130,7 +132,7 @@ class PosedPhotograph:
             InputError: See `encoded`.
         """
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        bgr = decode_image(self.encoded(), f"{self.where}, {self.file}", WHOLE, flags)
+        bgr = decode_image(self.encoded(), f"{self.location}, {self.file}", WHOLE, flags)
         return np.ascontiguousarray(self.lens.straightened(np.asarray(bgr, np.uint8)[..., ::-1]))
 
     def view(self) -> PosedView:
@@ -188,25 +190,27 @@ def present(
     Raises:
         InputError: Fewer than two exist, or one lies outside of the folder.
     """
-    there = [
+    existing = [
         photograph
         for photograph in photographs
-        if os.path.isfile(photograph.file) and inside(folder, photograph.file, photograph.where)
+        if os.path.isfile(photograph.file) and inside(folder, photograph.file, photograph.location)
     ]
     missing = tuple(
         photograph.file.as_posix().removeprefix(f"{folder.as_posix()}/")
         for photograph in photographs
         if not os.path.isfile(photograph.file)
     )
-    if len(there) < 2:
-        found = f"{folder}: {len(there)} of {len(photographs)} listed images exist"
+    if len(existing) < 2:
+        problem = f"{folder}: {len(existing)} of {len(photographs)} listed images exist"
         if missing and Path(missing[0]).is_absolute():
             raise InputError(
-                f"{found}: the file names paths of another machine, {missing[0]} the first",
+                f"{problem}: the file names paths of another machine, {missing[0]} the first",
                 "write the paths relative to the folder",
             )
-        raise InputError(found, f"give the images that the file names, {', '.join(missing[:1])} on")
-    return there, missing
+        raise InputError(
+            problem, f"give the images that the file names, {', '.join(missing[:1])} on"
+        )
+    return existing, missing
 
 
 def read_points(path: Path) -> GaussianCloud:
@@ -250,16 +254,18 @@ def resized(view: PosedView, width: int) -> PosedView:
     )
 
 
-def _photograph(folder: Path, frame: Mapping[str, Any], where: str, axes: F64) -> PosedPhotograph:
-    file = _file(folder, frame, "file_path", where)
+def _photograph(
+    folder: Path, frame: Mapping[str, Any], location: str, axes: F64
+) -> PosedPhotograph:
+    file = _file(folder, frame, "file_path", location)
     camera = frame.get("camera")
-    t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{where}, t_us")
-    pose = rigid_pose(frame.get("transform_matrix"), f"{where}, transform_matrix") @ axes
+    t_us = None if frame.get("t_us") is None else as_shape(int, frame["t_us"], f"{location}, t_us")
+    pose = rigid_pose(frame.get("transform_matrix"), f"{location}, transform_matrix") @ axes
     return PosedPhotograph(
         file,
-        _lens(frame, file, where),
+        _lens(frame, file, location),
         pose,
-        where,
+        location,
         t_us,
         None if camera is None else str(camera),
         frame,
@@ -287,17 +293,17 @@ def _focal_lengths(frame: Mapping[str, Any], width: int, height: int) -> tuple[f
     return lengths.get("x", lengths.get("y", np.nan)), lengths.get("y", lengths.get("x", np.nan))
 
 
-def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
+def _lens(frame: Mapping[str, Any], file: Path, location: str) -> Lens:
     model = frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV")
     undistort = "undistort the images first (colmap image_undistorter)"
     if model not in COEFFICIENTS:
         raise InputError(
-            f"{where}: lens model {model!r}", f"use {', '.join(COEFFICIENTS)}, or {undistort}"
+            f"{location}: lens model {model!r}", f"use {', '.join(COEFFICIENTS)}, or {undistort}"
         )
     others = [key for key in BENDS if frame.get(key) and key not in COEFFICIENTS[model]]
     if others or frame.get("distortion_params"):
         raise InputError(
-            f"{where}: {others[0] if others else 'distortion_params'} of a lens model {model}",
+            f"{location}: {others[0] if others else 'distortion_params'} of a lens model {model}",
             f"give it by {', '.join(COEFFICIENTS[model]) or 'none'}, or {undistort}",
         )
     do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/renderers.md)"
@@ -317,38 +323,38 @@ def _lens(frame: Mapping[str, Any], file: Path, where: str) -> Lens:
             [float(frame.get(key) or 0.0) for key in COEFFICIENTS[model]] or [0.0]
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{where}: {type(error).__name__}: {error}", do) from error
+        raise InputError(f"{location}: {type(error).__name__}: {error}", do) from error
     few = np.zeros(max(0, 4 - len(distortion)))  # OpenCV takes four at least
     fisheye = model == "OPENCV_FISHEYE"
     return Lens(
         width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv"
-    ).check(where, do)
+    ).check(location, do)
 
 
-def rigid_pose(value: Any, where: str) -> F64:
+def rigid_pose(value: Any, location: str) -> F64:
     """Return a pose ``(4, 4)`` whose rotation is exact, of a matrix written with a few digits.
 
     Raises:
         InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or
             left-handed.
     """
-    T = np.asarray(as_shape(list[list[float]], value, where), np.float64)
+    T = np.asarray(as_shape(list[list[float]], value, location), np.float64)
     if T.shape == (3, 4):
         T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        found = "a number that is not finite" if T.shape == (4, 4) else f"shape {T.shape}"
-        raise InputError(f"{where}: {found}", "give a finite matrix of 4 x 4")
+        problem = "a number that is not finite" if T.shape == (4, 4) else f"shape {T.shape}"
+        raise InputError(f"{location}: {problem}", "give a finite matrix of 4 x 4")
     u, _, vt = np.linalg.svd(T[:3, :3])
     rotation = u @ vt
     if np.linalg.det(rotation) < 0:
         raise InputError(
-            f"{where}: its axes are left-handed (determinant -1)",
+            f"{location}: its axes are left-handed (determinant -1)",
             "mirror one axis of the poses, and say in 'axes' how they lie",
         )
     off = np.abs(T[:3, :3] - rotation).max()
     if off > 1e-3:
         raise InputError(
-            f"{where}: its first three columns are no rotation (off by {off:.2g})",
+            f"{location}: its first three columns are no rotation (off by {off:.2g})",
             "give a rigid transform",
         )
     if off > RIGID:  # what is written with a few digits is not quite a rotation
@@ -356,7 +362,7 @@ def rigid_pose(value: Any, where: str) -> F64:
     return T
 
 
-def inside(folder: Path, path: Path, where: str) -> Path:
+def inside(folder: Path, path: Path, location: str) -> Path:
     """Return the path of a file that a folder's document names.
 
     Raises:
@@ -364,20 +370,19 @@ def inside(folder: Path, path: Path, where: str) -> Path:
     """
     if not os.path.abspath(path).startswith(os.path.join(os.path.abspath(folder), "")):
         raise InputError(
-            f"{where}: {path} lies outside of {folder}",
+            f"{location}: {path} lies outside of {folder}",
             "Put the file with the poses into a folder that holds what it names",
         )
     return path
 
 
-def _file(folder: Path, frame: Mapping[str, Any], key: str, where: str) -> Path:
+def _file(folder: Path, frame: Mapping[str, Any], key: str, location: str) -> Path:
     name = frame.get(key)
     if not isinstance(name, str):
-        raise InputError(f"{where}, {key}: {name!r}", "name a file, relative to the folder")
+        raise InputError(f"{location}, {key}: {name!r}", "name a file, relative to the folder")
     name = name.replace("\\", "/")  # of a file that was written under Windows
     path = folder / name
-    if not path.suffix and os.path.isfile(
-        folder / f"{name}.png"
-    ):  # NeRF's own scenes leave the ending out
+    # NeRF's own scenes leave the ending out
+    if not path.suffix and os.path.isfile(folder / f"{name}.png"):
         return folder / f"{name}.png"
     return path

@@ -26,14 +26,14 @@ class Comparison:
 
     Attributes:
         name: Of the view.
-        shown: ``(H, W, 3)`` uint8, the model's image, 8 bits as a file would hold it.
+        image: ``(H, W, 3)`` uint8, the model's image, 8 bits as a file would hold it.
         truth: ``(H, W, 3)`` uint8.
         psnr_db: Over the pixels that count.
         ssim: Mean over the image, masked pixels taken from the truth.
     """
 
     name: str
-    shown: U8
+    image: U8
     truth: U8
     psnr_db: float
     ssim: float
@@ -73,8 +73,8 @@ def _blurred_on_card(image: Tensor, window: Tensor) -> Tensor:
     planes = image.permute(2, 0, 1)[:, None]
     pad = WINDOW_PX // 2
     across = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, pad))
-    both = F.conv2d(across, window.view(1, 1, -1, 1), padding=(pad, 0))
-    return both[:, 0].permute(1, 2, 0)
+    blurred = F.conv2d(across, window.view(1, 1, -1, 1), padding=(pad, 0))
+    return blurred[:, 0].permute(1, 2, 0)
 
 
 class _Ssim(torch.autograd.Function):

@@ -112,8 +112,12 @@ class SplatRecipe:
 
     def sh_size_at(self, step: int) -> int:
         """Return how many colour coefficients are in use at a step."""
-        every = self.sh_share * self.steps
-        degree = self.sh_degree if every <= 0 else min(self.sh_degree, int(step / every))
+        steps_per_degree = self.sh_share * self.steps
+        degree = (
+            self.sh_degree
+            if steps_per_degree <= 0
+            else min(self.sh_degree, int(step / steps_per_degree))
+        )
         return (degree + 1) ** 2
 
     def densifies_after(self, done: int) -> bool:

@@ -150,20 +150,20 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
     )
 
 
-def _spread(image: F32, known: F32) -> F32:
+def _spread(image: F32, validity: F32) -> F32:
     """Fill unknown pixels from known ones near by: means over ever coarser cells, the finest that
     holds a known pixel (pull and push).
     """
-    if min(image.shape[:2]) <= 1 or known.all():
+    if min(image.shape[:2]) <= 1 or validity.all():
         return image
     half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
-    area = cv2.resize(known, half, interpolation=cv2.INTER_AREA)
+    area = cv2.resize(validity, half, interpolation=cv2.INTER_AREA)
     mean = (
-        cv2.resize(image * known[..., None], half, interpolation=cv2.INTER_AREA)
+        cv2.resize(image * validity[..., None], half, interpolation=cv2.INTER_AREA)
         / np.maximum(area, 1e-9)[..., None]
     )
     coarse = _spread(
         np.where(area[..., None] > 0, mean, 0).astype(np.float32), (area > 0).astype(np.float32)
     )
     filled = cv2.resize(coarse, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.where(known[..., None] > 0, image, filled), np.float32)
+    return np.asarray(np.where(validity[..., None] > 0, image, filled), np.float32)

@@ -23,10 +23,8 @@ from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.sh import dc_from_rgb
 
-RANGE_ERROR_M, RANGE_ERROR_SHARE = (
-    0.03,
-    0.004,
-)  # spread of a point along its ray: fixed, and by distance
+RANGE_ERROR_M = 0.03  # spread of a point along its ray
+RANGE_ERROR_SHARE = 0.004  # further spread, as a share of its distance
 # points this far outside an actor's sides still belong to it; below, its box ends this far above
 # the ground
 BOX_MARGIN_M = 0.1
@@ -37,11 +35,9 @@ FEWEST_POINTS = 4  # an actor seen less often gets no model
 # an actor's points are sampled this many times as densely as the background, because they are few
 # and seen from near
 DENSER = 8
-NEIGHBOURS, FEATURES, RATIO = (
-    4,
-    2500,
-    0.75,
-)  # of the next photographs; SIFT keypoints; Lowe's ratio test
+NEIGHBOURS = 4  # of the next photographs
+FEATURES = 2500  # SIFT keypoints
+RATIO = 0.75  # Lowe's ratio test
 _Points = tuple[F64, F64]  # (N, 3) places, metres; (N, 3) colours 0..1
 
 
@@ -79,7 +75,7 @@ def start_from_depth(
         InputError: No view has depth.
     """
     owned: dict[str, list[_Points]] = {name: [] for name in sorted(boxes)}
-    rest = []
+    background = []
     for i, view in enumerate(views):
         share = count * (i + 1) // len(views) - count * i // len(views)
         points, rgb = _sample(
@@ -91,12 +87,12 @@ def start_from_depth(
             box = boxes[actor_id]
             half = np.array(box.size_m) / 2 + BOX_MARGIN_M
             above_ground = local[:, 2] > -box.height_m / 2 + BOX_MARGIN_M / 2
-            mine = free & (np.all(np.abs(local) <= half, axis=1) & above_ground)
-            owned[actor_id].append((local[mine], rgb[mine]))
-            free &= ~mine
+            in_box = free & (np.all(np.abs(local) <= half, axis=1) & above_ground)
+            owned[actor_id].append((local[in_box], rgb[in_box]))
+            free &= ~in_box
         free[share:] = False  # the sample is in random order: its first part is a sample too
-        rest.append((points[free], rgb[free]))
-    if not sum(len(points) for points, _ in rest):
+        background.append((points[free], rgb[free]))
+    if not sum(len(points) for points, _ in background):
         raise InputError(
             f"{len(views)} views: no pixel with depth",
             "give views with depth, or a file of points to start from",
@@ -108,7 +104,7 @@ def start_from_depth(
         chosen = rng.permutation(len(points))[:actor_points]
         if len(chosen) >= FEWEST_POINTS:
             actors[name] = cloud_from_points(points[chosen], rgb[chosen])
-    return Start(cloud_from_points(*_joined(rest)), actors)
+    return Start(cloud_from_points(*_joined(background)), actors)
 
 
 def start_from_maps(
@@ -217,18 +213,18 @@ class Match(NamedTuple):
 
 
 def matches(views: Sequence[PosedView]) -> list[Match]:
-    """Return points that a view and one of its next ones show: SIFT, nearest neighbours in both
+    """Match points between each view and the next `NEIGHBOURS`: SIFT, nearest neighbours in both
     directions, ratio test.
     """
     sift, matcher = cv2.SIFT_create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)  # type: ignore[attr-defined]
-    found = []
+    features = []
     for view in views:
         points, described = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
-        found.append((np.array([p.pt for p in points]).reshape(-1, 2) + 0.5, described))
+        features.append((np.array([p.pt for p in points]).reshape(-1, 2) + 0.5, described))
     out = []
     for i in range(len(views)):
         for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(views))):
-            (at_i, describes_i), (at_j, describes_j) = found[i], found[j]
+            (at_i, describes_i), (at_j, describes_j) = features[i], features[j]
             if describes_i is None or describes_j is None or len(at_i) < 2 or len(at_j) < 2:
                 continue
             back = {

@@ -28,23 +28,19 @@ from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.views import PosedView
 
-CORNERS, APART_PX, QUALITY = (
-    1500,
-    7,
-    0.003,
-)  # of a photograph: most corners, their distance, and their least strength
+CORNERS = 1500  # most corners of a photograph
+APART_PX = 7  # least distance of two corners
+QUALITY = 0.003  # least strength of a corner
 BACK_PX = 0.4  # following a point there and back may end so far from where it began
 WINDOW = (15, 15)
-ROUNDS, HUBER_PX = (
-    8,
-    1.0,
-)  # of placing a point: Gauss-Newton steps, and the error from which one counts less
+ROUNDS = 8  # Gauss-Newton steps that place a point
+HUBER_PX = 1.0  # an observation with a larger error counts less
 ADJUSTING_ROUNDS = 12  # of correcting poses
-SIGMA_M, SIGMA_RAD = 0.05, 0.003  # of a given pose: what correction is likely
-LARGEST_ERROR_PX, LEAST_ANGLE_RAD = (
-    3.0,
-    0.01,
-)  # of observations that adjust poses, and of their points
+# Likely correction of a given pose
+SIGMA_M = 0.05
+SIGMA_RAD = 0.003
+LARGEST_ERROR_PX = 3.0  # of observations that adjust poses
+LEAST_ANGLE_RAD = 0.01  # between the rays to points that adjust poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +50,13 @@ class Tracks:
     Attributes:
         view: ``(M,)`` which photograph each observation is of.
         point: ``(M,)`` which point it shows, 0..P-1, ascending.
-        at: ``(M, 2)`` where, pixels of that photograph; the first pixel's centre is at (0.5, 0.5).
+        pixel: ``(M, 2)`` where in that photograph, pixels; the first pixel's centre is at (0.5, 0.5).
         count: P.
     """
 
     view: I64
     point: I64
-    at: F64
+    pixel: F64
     count: int
 
     def only(self, keep: Bool) -> Tracks:
@@ -69,11 +65,11 @@ class Tracks:
         """
         view = self.view[keep]
         point = self.point[keep]
-        at = self.at[keep]
+        pixel = self.pixel[keep]
         times = np.bincount(point, minlength=self.count)
         stay = times[point] >= 2
         ids, number = np.unique(point[stay], return_inverse=True)
-        return Tracks(view[stay], number.astype(np.int64), at[stay], len(ids))
+        return Tracks(view[stay], number.astype(np.int64), pixel[stay], len(ids))
 
 
 def follow(views: Sequence[PosedView]) -> Tracks:
@@ -90,10 +86,10 @@ def follow(views: Sequence[PosedView]) -> Tracks:
         free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
         for x, y in np.rint(points).astype(int):
             cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
-        found = cv2.goodFeaturesToTrack(
+        corners = cv2.goodFeaturesToTrack(
             grey, max(CORNERS - len(points), 1), QUALITY, APART_PX, mask=free
         )
-        fresh = np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+        fresh = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         points = np.concatenate([points, fresh])
         ids = np.concatenate([ids, count + np.arange(len(fresh))])
         count += len(fresh)
@@ -101,10 +97,10 @@ def follow(views: Sequence[PosedView]) -> Tracks:
         if i + 1 < len(views) and len(points):
             b = greys[i + 1]
             options = {"winSize": WINDOW, "maxLevel": 4}
-            there, ok, _ = cv2.calcOpticalFlowPyrLK(grey, b, points[:, None], None, **options)  # type: ignore[call-overload,unused-ignore]
-            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, grey, there, None, **options)  # type: ignore[call-overload,unused-ignore]
+            flowed, ok, _ = cv2.calcOpticalFlowPyrLK(grey, b, points[:, None], None, **options)  # type: ignore[call-overload,unused-ignore]
+            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, grey, flowed, None, **options)  # type: ignore[call-overload,unused-ignore]
             off = np.linalg.norm(back[:, 0] - points, axis=1)
-            moved = there[:, 0]
+            moved = flowed[:, 0]
             inside = (
                 (moved[:, 0] >= 0)
                 & (moved[:, 1] >= 0)
@@ -115,9 +111,9 @@ def follow(views: Sequence[PosedView]) -> Tracks:
             kept = (ok[:, 0] == 1) & (ok_back[:, 0] == 1) & (off < BACK_PX) & inside
             points = points[kept]
             ids = ids[kept]
-    view, point, at = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    view, point, pixel = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
-    all_ = Tracks(view[order], point[order], at[order], count)
+    all_ = Tracks(view[order], point[order], pixel[order], count)
     return all_.only(np.ones(len(order), bool))
 
 
@@ -145,7 +141,7 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
     R, t, K = pose_arrays(cameras)
     centre = -np.einsum("nji,nj->ni", R, t)
     local = np.einsum(
-        "nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.at, np.ones(len(tracks.at))]
+        "nij,nj->ni", np.linalg.inv(K)[tracks.view], np.c_[tracks.pixel, np.ones(len(tracks.pixel))]
     )
     ray = np.einsum("nji,nj->ni", R[tracks.view], local)
     ray = unit(ray)
@@ -194,7 +190,7 @@ def residuals(xyz: F64, tracks: Tracks, R: F64, t: F64, K: F64) -> tuple[F64, F6
     z = np.where(np.abs(local[:, 2]) < 1e-6, 1e-6, local[:, 2])
     focal = np.stack([K[tracks.view, 0, 0], K[tracks.view, 1, 1]], axis=1)
     middle = np.stack([K[tracks.view, 0, 2], K[tracks.view, 1, 2]], axis=1)
-    error = focal * local[:, :2] / z[:, None] + middle - tracks.at
+    error = focal * local[:, :2] / z[:, None] + middle - tracks.pixel
     slope = np.zeros((len(local), 2, 3))
     slope[:, 0, 0] = focal[:, 0] / z
     slope[:, 1, 1] = focal[:, 1] / z
@@ -250,7 +246,7 @@ def _good(tracks: Tracks, placed: Placed, error_px: float) -> Bool:
 
 
 def _solve(
-    given: Sequence[PinholeCamera],
+    cameras: Sequence[PinholeCamera],
     tracks: Tracks,
     xyz: F64,
     begin: Sequence[PinholeCamera],
@@ -258,7 +254,7 @@ def _solve(
     """Minimise robust reprojection error and distance from the given poses by Gauss-Newton; points
     are eliminated (Schur complement).
     """
-    R0, t0, K = pose_arrays(given)
+    R0, t0, K = pose_arrays(cameras)
     R, t = (a.copy() for a in pose_arrays(begin)[:2])
     for _ in range(ADJUSTING_ROUNDS):
         step, points = _step(R, t, K, R0, t0, tracks, xyz)
@@ -270,7 +266,7 @@ def _solve(
             break
     return [
         replace(camera, T_camera_world=rigid(rotation, shift))
-        for camera, rotation, shift in zip(given, R, t, strict=True)
+        for camera, rotation, shift in zip(cameras, R, t, strict=True)
     ]
 
 
@@ -285,6 +281,7 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     error, slope, local = residuals(xyz, tracks, R, t, K)
     x, y, z = local.T
     o = np.zeros_like(x)
+    # (M, 2, 6), the derivative of the local point by its camera's turn and shift
     by_pose = np.concatenate(
         [
             -slope
@@ -294,7 +291,7 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
             slope,
         ],
         axis=2,
-    )  # (M, 2, 6)
+    )
     by_point = slope @ R[view]  # (M, 2, 3)
     weight = huber(error)[:, None, None]
     weighted_pose = by_pose.transpose(0, 2, 1) * weight

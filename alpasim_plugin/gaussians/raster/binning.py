@@ -38,9 +38,9 @@ def tile_boxes(records, tiles_x, tiles_y, boxes):
     In the order of the records: that of depth would wait for memory at each of them.
     """
     for splat in range(boxes.shape[0]):
-        at = splat * RECORD
-        left, right = _tile_span(records[at + U], records[at + RADIUS_X], tiles_x)
-        top, bottom = _tile_span(records[at + V], records[at + RADIUS_Y], tiles_y)
+        offset = splat * RECORD
+        left, right = _tile_span(records[offset + U], records[offset + RADIUS_X], tiles_x)
+        top, bottom = _tile_span(records[offset + V], records[offset + RADIUS_Y], tiles_y)
         boxes[splat, 0] = left
         boxes[splat, 1] = right
         boxes[splat, 2] = top
@@ -78,10 +78,10 @@ def fill_tiles(cursor, chunk_size, order, boxes, tiles_x, position, lists):
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= position.shape[0]:
             return
-        at = position[chunk]
+        next_place = position[chunk]
         for splat in order[chunk * chunk_size : (chunk + 1) * chunk_size]:
             left, right, top, bottom = boxes[splat]
             for row in range(top, bottom):
                 for tile in range(row * tiles_x + left, row * tiles_x + right):
-                    lists[at[tile]] = splat
-                    at[tile] += 1
+                    lists[next_place[tile]] = splat
+                    next_place[tile] += 1

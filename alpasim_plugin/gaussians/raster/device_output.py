@@ -75,8 +75,8 @@ class DeviceOutput(RasterOutput):
 
     def frame(self, t_us: int, camera: str) -> Frame:
         """Return the view as a camera's frame, whose planes stay on the device."""
-        shown = self.changed(lambda out: {"rgb": (out.rgb * 255 + 0.5).to(torch.uint8)})
-        return Frame(t_us, camera, on_device=cast(DevicePlanes, shown))
+        planes = self.changed(lambda out: {"rgb": (out.rgb * 255 + 0.5).to(torch.uint8)})
+        return Frame(t_us, camera, on_device=cast(DevicePlanes, planes))
 
     def changed(self, change: Callable[[Any], Mapping[str, Any]]) -> Self:
         """Return the view with other planes, which it also has when it is drawn again."""

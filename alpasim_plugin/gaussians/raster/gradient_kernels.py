@@ -54,22 +54,32 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
     live = 0
     end = 0
     for block in range(16):
-        at = (tile * 16 + block) * KEPT
+        kept_offset = (tile * 16 + block) * KEPT
         base = block * _BACK
         for pixel in range(16):
             x, y = pixel_of(tile_x, tile_y, block, pixel)
-            here = base + pixel
-            last = kept[at + KEPT_LAST + pixel]
-            pixels[here + KEPT_T], pixels[here + KEPT_LAST] = kept[at + KEPT_T + pixel], last
+            block_offset = base + pixel
+            last = kept[kept_offset + KEPT_LAST + pixel]
+            pixels[block_offset + KEPT_T], pixels[block_offset + KEPT_LAST] = (
+                kept[kept_offset + KEPT_T + pixel],
+                last,
+            )
             if last >= _f(0.0):  # pixels outside of the image have none
                 live |= 1 << block
                 end = max(end, int(last) + 1)
-                pixels[here + _GR], pixels[here + _GG], pixels[here + _GB] = (
+                (
+                    pixels[block_offset + _GR],
+                    pixels[block_offset + _GG],
+                    pixels[block_offset + _GB],
+                ) = (
                     g_colour[y, x, 0],
                     g_colour[y, x, 1],
                     g_colour[y, x, 2],
                 )
-                pixels[here + _GD], pixels[here + _GA] = g_depth[y, x], g_alpha[y, x]
+                pixels[block_offset + _GD], pixels[block_offset + _GA] = (
+                    g_depth[y, x],
+                    g_alpha[y, x],
+                )
     return live, end
 
 
@@ -79,11 +89,11 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
     zero = v.splat(_f(0.0))
     for i in range(end - 1, -1, -1):
         v.prefetch(records, np.int64(lists[first + max(i - 8, 0)]) * RECORD)
-        at = np.int64(lists[first + i]) * RECORD
-        todo = touched_blocks(records, at, x0, y0) & live
+        offset = np.int64(lists[first + i]) * RECORD
+        todo = touched_blocks(records, offset, x0, y0) & live
         if todo == 0:
             continue
-        red, green, blue = records[at + R], records[at + G], records[at + B]
+        red, green, blue = records[offset + R], records[offset + G], records[offset + B]
         to_red = zero
         to_green = zero
         to_blue = zero
@@ -99,12 +109,12 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             todo &= todo - 1
             base = block * _BACK
             x, y = block_centres(x0, y0, block)
-            s, t = whitened(records, at, x, y)
-            exponent = v.fnma(s, s, v.fnma(t, t, records[at + PEAK]))
-            drawn = (exponent >= CUT) & (v.load(pixels, base + KEPT_LAST) >= i)
-            if v.bits(drawn) == 0:
+            s, t = whitened(records, offset, x, y)
+            exponent = v.fnma(s, s, v.fnma(t, t, records[offset + PEAK]))
+            visible = (exponent >= CUT) & (v.load(pixels, base + KEPT_LAST) >= i)
+            if v.bits(visible) == 0:
                 continue
-            full = v.select(drawn, falloff(exponent), 0.0)
+            full = v.select(visible, falloff(exponent), 0.0)
             alpha = v.minimum(full, ALPHA_MAX)
             inverse = 1.0 / (1.0 - alpha)
             before = v.load(pixels, base + KEPT_T) * inverse
@@ -112,7 +122,7 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             g_green = v.load(pixels, base + _GG)
             g_blue = v.load(pixels, base + _GB)
             g_depth = v.load(pixels, base + _GD)
-            q = v.fma(records[at + Z], g_depth, v.load(pixels, base + _GA))
+            q = v.fma(records[offset + Z], g_depth, v.load(pixels, base + _GA))
             q = v.fma(red, g_red, v.fma(green, g_green, v.fma(blue, g_blue, q)))
             behind = v.load(pixels, base + _S)
             weight = before * alpha

@@ -67,14 +67,14 @@ CHUNK = 16  # groups that a thread takes at once
 
 
 @kernel
-def _load3(array, at):
-    return v.load(array, at), v.load(array, at + 16), v.load(array, at + 32)
+def _load3(array, offset):
+    return v.load(array, offset), v.load(array, offset + 16), v.load(array, offset + 32)
 
 
 @kernel
-def _row(pose, at):
+def _row(pose, offset):
     """Return three numbers of a pose."""
-    return pose[at], pose[at + 1], pose[at + 2]
+    return pose[offset], pose[offset + 1], pose[offset + 2]
 
 
 @kernel
@@ -315,9 +315,9 @@ def project_part(
             if chosen == 0:
                 continue
             count = 0
-            rest = chosen
-            while rest != 0:
-                rest &= rest - 1
+            remaining = chosen
+            while remaining != 0:
+                remaining &= remaining - 1
                 count += 1
             out = v.fetch_add(cursor, 0, count)
             while chosen != 0:

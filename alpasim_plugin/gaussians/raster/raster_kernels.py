@@ -101,27 +101,27 @@ def start_tile(state, x0, y0, width, height):
 
 
 @kernel
-def whitened(records, at, x, y):
+def whitened(records, offset, x, y):
     """Return ``s`` and ``t`` at sixteen pixel centres: the splat's exponent is ``peak - s^2 -
     t^2``.
     """
-    dx = x - records[at + U]
-    dy = y - records[at + V]
-    s = v.fma(records[at + L11], dx, records[at + L12] * dy)
-    return s, records[at + L22] * dy
+    dx = x - records[offset + U]
+    dy = y - records[offset + V]
+    s = v.fma(records[offset + L11], dx, records[offset + L12] * dy)
+    return s, records[offset + L22] * dy
 
 
 @kernel
-def touched_blocks(records, at, x0, y0):
+def touched_blocks(records, offset, x0, y0):
     """Return the bit mask of the sixteen blocks that a splat can touch; ``x0, y0`` is the centre of
     the tile's first pixel.
     """
     x = v.lane_pattern(_f(4.0), _f(0.0)) + (x0 + _f(1.5))
     y = v.lane_pattern(_f(0.0), _f(4.0)) + (y0 + _f(1.5))
-    s, t = whitened(records, at, x, y)
-    touched = v.fma(s, s, t * t) <= records[at + BLOCK_REACH]
-    in_columns = v.absolute(x - records[at + U]) <= records[at + RADIUS_X] + _f(1.5)
-    in_rows = v.absolute(y - records[at + V]) <= records[at + RADIUS_Y] + _f(1.5)
+    s, t = whitened(records, offset, x, y)
+    touched = v.fma(s, s, t * t) <= records[offset + BLOCK_REACH]
+    in_columns = v.absolute(x - records[offset + U]) <= records[offset + RADIUS_X] + _f(1.5)
+    in_rows = v.absolute(y - records[offset + V]) <= records[offset + RADIUS_Y] + _f(1.5)
     return v.bits(touched & in_columns & in_rows)
 
 
@@ -159,21 +159,21 @@ def _blend_block(block, x, y, first, masks, near, state, kept, kept_at):
         while touching != 0:
             place = word * 64 + v.lowest_bit(touching)
             touching &= touching - 1
-            at = place * RECORD
-            s, t = whitened(near, at, x, y)
-            exponent = v.fnma(s, s, v.fnma(t, t, near[at + PEAK]))
-            drawn = exponent >= CUT
-            alpha = v.select(drawn, v.minimum(falloff(exponent), ALPHA_MAX), 0.0)
+            offset = place * RECORD
+            s, t = whitened(near, offset, x, y)
+            exponent = v.fnma(s, s, v.fnma(t, t, near[offset + PEAK]))
+            visible = exponent >= CUT
+            alpha = v.select(visible, v.minimum(falloff(exponent), ALPHA_MAX), 0.0)
             after = v.fnma(through, alpha, through)
             goes_on = after > TRANSMITTANCE_STOP
             weight = v.select(goes_on, through * alpha, 0.0)
             through = v.select(goes_on, after, v.negative(v.absolute(through)))
-            red = v.fma(weight, near[at + R], red)
-            green = v.fma(weight, near[at + G], green)
-            blue = v.fma(weight, near[at + B], blue)
-            depth = v.fma(weight, near[at + Z], depth)
+            red = v.fma(weight, near[offset + R], red)
+            green = v.fma(weight, near[offset + G], green)
+            blue = v.fma(weight, near[offset + B], blue)
+            depth = v.fma(weight, near[offset + Z], depth)
             if kept is not None:
-                last = v.select(goes_on & drawn, first + place, v.load(kept, kept_at + KEPT_LAST))
+                last = v.select(goes_on & visible, first + place, v.load(kept, kept_at + KEPT_LAST))
                 v.store(kept, kept_at + KEPT_LAST, last)
             if v.bits(through > 0.0) == 0:
                 finished = True
@@ -201,9 +201,9 @@ def composite_tile(lists, start, end, records, x0, y0, state, live, kept, kept_a
         size = min(CHUNK, end - first)
         for i in range(size):
             v.prefetch(records, np.int64(lists[min(first + i + 16, end - 1)]) * RECORD)
-            at = np.int64(lists[first + i]) * RECORD
-            v.store(near, i * RECORD, v.load(records, at))
-            masks[i] = touched_blocks(records, at, x0, y0)
+            offset = np.int64(lists[first + i]) * RECORD
+            v.store(near, i * RECORD, v.load(records, offset))
+            masks[i] = touched_blocks(records, offset, x0, y0)
         for i in range(size, CHUNK):
             masks[i] = 0
         todo = live
@@ -211,8 +211,8 @@ def composite_tile(lists, start, end, records, x0, y0, state, live, kept, kept_a
             block = v.lowest_bit(todo)
             todo &= todo - 1
             x, y = block_centres(x0, y0, block)
-            at = kept_at + block * KEPT
-            if _blend_block(block, x, y, first - start, masks, near, state, kept, at):
+            offset = kept_at + block * KEPT
+            if _blend_block(block, x, y, first - start, masks, near, state, kept, offset):
                 live &= ~(1 << block)
         if live == 0:
             return
@@ -248,9 +248,9 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         live = start_tile(state, x0, y0, width, height)
         kept_at = tile * 16 * KEPT
         if kept is not None:
-            for at in range(kept_at, kept_at + 16 * KEPT, KEPT):
-                v.store(kept, at + KEPT_T, v.splat(_f(1.0)))
-                v.store(kept, at + KEPT_LAST, v.splat(_f(-1.0)))
+            for offset in range(kept_at, kept_at + 16 * KEPT, KEPT):
+                v.store(kept, offset + KEPT_T, v.splat(_f(1.0)))
+                v.store(kept, offset + KEPT_LAST, v.splat(_f(-1.0)))
         first = starts[tile]
         end = starts[tile + 1]
         composite_tile(lists, first, end, records, x0, y0, state, live, kept, kept_at, near, masks)
@@ -258,8 +258,8 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
             y = tile_y * TILE + row
             for column in range(min(TILE, width - tile_x * TILE)):
                 x = tile_x * TILE + column
-                at = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
-                alpha[y, x] = _f(1.0) - abs(state[at + STATE_T])
-                depth_sum[y, x] = state[at + STATE_D]
+                offset = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
+                alpha[y, x] = _f(1.0) - abs(state[offset + STATE_T])
+                depth_sum[y, x] = state[offset + STATE_D]
                 for channel in range(3):
-                    colour[y, x, channel] = state[at + STATE_R + 16 * channel]
+                    colour[y, x, channel] = state[offset + STATE_R + 16 * channel]

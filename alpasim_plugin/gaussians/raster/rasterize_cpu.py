@@ -202,25 +202,23 @@ def node_poses(
     Raises:
         InputError: A transform is not rigid.
     """
-    given = [_IDENTITY, *(np.asarray(T, np.float64) for T in T_world_nodes if T is not None)]
-    shaped = all(T.shape == (4, 4) for T in given)
-    if not shaped or not all_rigid(np.array(given)):
-        for T in (
-            given
-        ):  # the precise message is composed only where the cheap test of all nodes at once fails
+    poses = [_IDENTITY, *(np.asarray(T, np.float64) for T in T_world_nodes if T is not None)]
+    shaped = all(T.shape == (4, 4) for T in poses)
+    if not shaped or not all_rigid(np.array(poses)):
+        # The precise message is composed only where the cheap test of all nodes at once fails.
+        for T in poses:
             require_rigid(T)
-    T_world_node = np.array(given)
+    T_world_node = np.array(poses)
     rotation = T_world_node[:, :3, :3]
-    placed = np.zeros((len(given), POSE_SIZE))
+    placed = np.zeros((len(poses), POSE_SIZE))
     placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
     placed[:, POSE_CENTRE:POSE_ANTIALIAS] = np.einsum(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
     )
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
     moved = np.array([T is not None for T in T_world_nodes], bool)
-    return placed[
-        np.where(moved, np.cumsum(moved), 0)
-    ]  # all that stand in the world share the first
+    # All that stand in the world share the first
+    return placed[np.where(moved, np.cumsum(moved), 0)]
 
 
 def rasterize_cpu(

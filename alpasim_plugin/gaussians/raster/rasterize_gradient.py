@@ -159,25 +159,25 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
         (True, torch.Size([1, 2]))
     """
-    seen = splats
+    candidates = splats
     if compositor is None:
         with torch.no_grad():
             index = _candidates(splats, camera, near_m)
-        seen = Splats(*(tensor.index_select(0, index) for tensor in splats))
-        local = _in_camera(seen.means, camera)
+        candidates = Splats(*(tensor.index_select(0, index) for tensor in splats))
+        local = _in_camera(candidates.means, camera)
     else:
         local = _in_camera(splats.means, camera)
-        drawn = _is_drawn(local, splats, near_m)
-        index = torch.arange(len(drawn), device=drawn.device)
+        visible = _is_drawn(local, splats, near_m)
+        index = torch.arange(len(visible), device=visible.device)
         # What is behind the camera has no projection: its gradient would be 0 times infinity.
-        local = torch.where(drawn, local, 1.0)
-    uv, m, n = _ellipses(local, seen, camera)
+        local = torch.where(visible, local, 1.0)
+    uv, m, n = _ellipses(local, candidates, camera)
     if uv.requires_grad:
         uv.retain_grad()
-    log_opacity = torch.nn.functional.logsigmoid(seen.logit_opacities)
+    log_opacity = torch.nn.functional.logsigmoid(candidates.logit_opacities)
     world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
     terms = sh_terms(*(world * _dot(world, world).rsqrt()))
-    constant, *higher = seen.sh.unbind(1)
+    constant, *higher = candidates.sh.unbind(1)
     colour = 0.5 + C0 * constant
     for term, coefficients in zip(terms, higher, strict=False):
         colour = colour + term[:, None] * coefficients
@@ -192,7 +192,7 @@ def rasterize_gradient(
         if compositor is None:
             images, sums, pairs = _on_cpu(records, camera, thread_count(threads))
         else:
-            on_screen &= drawn
+            on_screen &= visible
             images, sums, pairs = _on_gpu(records, log_opacity, on_screen, camera, compositor)
     colour_sum, alpha, depth_sum = _Composite.apply(*projected, images, sums, scale)  # type: ignore[no-untyped-call]
     rgb = colour_sum
@@ -347,9 +347,8 @@ def _records(
 
 
 Images = tuple[Tensor, Tensor, Tensor]  # sums of weighted colours, alpha, sums of weighted depths
-Sums = Callable[
-    [Tensor, Tensor, Tensor], Tensor
-]  # their gradients to what a splat receives (M, PAIR)
+# Their gradients to what a splat receives (M, PAIR)
+Sums = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def _on_cpu(records: Tensor, camera: PinholeCamera, threads: int) -> tuple[Images, Sums, Tensor]:

@@ -195,17 +195,16 @@ def composite_reference(
         c11, c12, c22 = splats.cov[i]
         distance2 = (c22 * dx * dx - 2 * c12 * dx * dy + c11 * dy * dy) / splats.det[i]
         alpha = np.minimum(ALPHA_MAX, splats.opacity[i] * np.exp(-0.5 * distance2))
-        drawn = (alpha >= ALPHA_MIN) & ~finished[box]
+        visible = (alpha >= ALPHA_MIN) & ~finished[box]
         after = transmittance[box] * (1 - alpha)
-        stops = drawn & (
-            after <= TRANSMITTANCE_STOP
-        )  # this splat is left out, and so is everything behind it
+        # This splat is left out, and so is everything behind it.
+        stops = visible & (after <= TRANSMITTANCE_STOP)
         finished[box] |= stops
-        drawn &= ~stops
-        weight = np.where(drawn, alpha * transmittance[box], 0.0)
+        visible &= ~stops
+        weight = np.where(visible, alpha * transmittance[box], 0.0)
         colour[box] += weight[:, :, None] * splats.rgb[i]
         depth_sum[box] += weight * splats.depth[i]
-        transmittance[box] = np.where(drawn, after, transmittance[box])
+        transmittance[box] = np.where(visible, after, transmittance[box])
 
     alpha_total = 1 - transmittance
     depth = np.divide(depth_sum, alpha_total, out=np.zeros_like(depth_sum), where=alpha_total > 0)

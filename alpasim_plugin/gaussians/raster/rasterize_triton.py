@@ -136,8 +136,8 @@ class TileCompositor:
                 BLOCK=BLOCK,
             )
         sorted_tiles, places = torch.sort(tiles, stable=True)
-        every = torch.arange(tile_count + 1, dtype=torch.int32, device=self.device)
-        starts = torch.searchsorted(sorted_tiles, every).to(torch.int32)
+        tile_numbers = torch.arange(tile_count + 1, dtype=torch.int32, device=self.device)
+        starts = torch.searchsorted(sorted_tiles, tile_numbers).to(torch.int32)
         splats = splats[places]
         image = self._empty((views, height, width, kernels.PIXEL), torch.float32)
         kernels.composite[(tile_count,)](
@@ -284,7 +284,7 @@ class UploadedClouds(TileCompositor):
         ]
 
     def _image(self, views: Sequence[CloudView], near_m: float) -> tuple[Tensor, Tensor]:
-        """Return what `composite` does of the clouds, and the number of pairs of splat and tile."""
+        """Return the composited images of the views, and the number of pairs of splat and tile."""
         kernels = self.kernels
         poses = np.concatenate([self._poses(*view, near_m) for view in views])
         numbers = [
@@ -317,8 +317,8 @@ class UploadedClouds(TileCompositor):
                 TILE=TILE,
                 BLOCK=BLOCK,
             )
-        drawn = self.composite(records, depths, boxes, counts, views[0][0], len(views))
-        return drawn.image, counts.sum(dtype=torch.int32)
+        batch = self.composite(records, depths, boxes, counts, views[0][0], len(views))
+        return batch.image, counts.sum(dtype=torch.int32)
 
     def _poses(self, camera: PinholeCamera, nodes: Sequence[DrawnCloud], near_m: float) -> F64:
         """Return the poses of a view's nodes ``(N, POSE)``."""
@@ -332,10 +332,12 @@ class UploadedClouds(TileCompositor):
         """Return the table of blocks ``(B, SPAN)``: node among those of all views, first Gaussian,
         number of Gaussians, view.
         """
-        drawn = [(view, node.cloud) for view, (_, nodes) in enumerate(views) for node in nodes]
-        view, cloud = np.array(drawn, np.int64).reshape(-1, 2).T
+        view_clouds = [
+            (view, node.cloud) for view, (_, nodes) in enumerate(views) for node in nodes
+        ]
+        view, cloud = np.array(view_clouds, np.int64).reshape(-1, 2).T
         blocks = -(-self.sizes[cloud] // BLOCK)
-        node = np.repeat(np.arange(len(drawn)), blocks)
+        node = np.repeat(np.arange(len(view_clouds)), blocks)
         before = np.arange(len(node)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
         first = self.first[cloud[node]] + before * BLOCK
         size = np.minimum(self.sizes[cloud[node]] - before * BLOCK, BLOCK)

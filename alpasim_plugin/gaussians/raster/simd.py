@@ -254,8 +254,8 @@ def has_bit(typingctx, a, position):
 
     def codegen(context, builder, sig, args):
         bit = builder.shl(_I32(1), builder.trunc(args[1], _I32))
-        both = builder.and_(args[0], _broadcast(builder, bit))
-        return builder.icmp_unsigned("!=", both, ir.Constant(_VECTORS["i32"], None))
+        masked = builder.and_(args[0], _broadcast(builder, bit))
+        return builder.icmp_unsigned("!=", masked, ir.Constant(_VECTORS["i32"], None))
 
     return MASK16(I32X16, types.int64), codegen
 
@@ -328,9 +328,8 @@ def prefetch(typingctx, array, index):
         pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
         kind = ir.FunctionType(ir.VoidType(), [pointer.type, _I32, _I32, _I32])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(
-            function, [pointer, _I32(0), _I32(3), _I32(1)]
-        )  # read, keep in all caches, data
+        # Read access (0), kept in all caches (3), of data (1).
+        builder.call(function, [pointer, _I32(0), _I32(3), _I32(1)])
         return context.get_dummy_value()
 
     return types.void(array, types.intp), codegen

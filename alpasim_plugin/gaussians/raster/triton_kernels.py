@@ -35,33 +35,33 @@ _C30, _C31, _C32, _C33, _C34 = (tl.constexpr(value) for value in sh.C3)
 
 
 @triton.jit
-def _colour(sh_ptr, at, drawn, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.constexpr):
+def _colour(sh_ptr, offset, visible, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.constexpr):
     """Return one colour channel of splats seen along unit directions, 0 where it would be less.
 
-    ``at`` is the first coefficient of each splat; the order is that of `sh.sh_terms`.
+    ``offset`` is the first coefficient of each splat; the order is that of `sh.sh_terms`.
     """
-    at += CHANNEL
-    value = 0.5 + _C0 * tl.load(sh_ptr + at, drawn, 0.0)
+    offset += CHANNEL
+    value = 0.5 + _C0 * tl.load(sh_ptr + offset, visible, 0.0)
     if SIZE > 1:
-        value -= _C1 * y * tl.load(sh_ptr + at + 3, drawn, 0.0)
-        value += _C1 * z * tl.load(sh_ptr + at + 6, drawn, 0.0)
-        value -= _C1 * x * tl.load(sh_ptr + at + 9, drawn, 0.0)
+        value -= _C1 * y * tl.load(sh_ptr + offset + 3, visible, 0.0)
+        value += _C1 * z * tl.load(sh_ptr + offset + 6, visible, 0.0)
+        value -= _C1 * x * tl.load(sh_ptr + offset + 9, visible, 0.0)
     if SIZE > 4:
-        value += _C20 * x * y * tl.load(sh_ptr + at + 12, drawn, 0.0)
-        value -= _C20 * y * z * tl.load(sh_ptr + at + 15, drawn, 0.0)
-        value += _C21 * (2 * z * z - x * x - y * y) * tl.load(sh_ptr + at + 18, drawn, 0.0)
-        value -= _C20 * x * z * tl.load(sh_ptr + at + 21, drawn, 0.0)
-        value += _C22 * (x * x - y * y) * tl.load(sh_ptr + at + 24, drawn, 0.0)
+        value += _C20 * x * y * tl.load(sh_ptr + offset + 12, visible, 0.0)
+        value -= _C20 * y * z * tl.load(sh_ptr + offset + 15, visible, 0.0)
+        value += _C21 * (2 * z * z - x * x - y * y) * tl.load(sh_ptr + offset + 18, visible, 0.0)
+        value -= _C20 * x * z * tl.load(sh_ptr + offset + 21, visible, 0.0)
+        value += _C22 * (x * x - y * y) * tl.load(sh_ptr + offset + 24, visible, 0.0)
     if SIZE > 9:
         four_zz = 4 * z * z - x * x - y * y
-        value -= _C30 * y * (3 * x * x - y * y) * tl.load(sh_ptr + at + 27, drawn, 0.0)
-        value += _C31 * x * y * z * tl.load(sh_ptr + at + 30, drawn, 0.0)
-        value -= _C32 * y * four_zz * tl.load(sh_ptr + at + 33, drawn, 0.0)
+        value -= _C30 * y * (3 * x * x - y * y) * tl.load(sh_ptr + offset + 27, visible, 0.0)
+        value += _C31 * x * y * z * tl.load(sh_ptr + offset + 30, visible, 0.0)
+        value -= _C32 * y * four_zz * tl.load(sh_ptr + offset + 33, visible, 0.0)
         cubic = z * (2 * z * z - 3 * x * x - 3 * y * y)
-        value += _C33 * cubic * tl.load(sh_ptr + at + 36, drawn, 0.0)
-        value -= _C32 * x * four_zz * tl.load(sh_ptr + at + 39, drawn, 0.0)
-        value += _C34 * z * (x * x - y * y) * tl.load(sh_ptr + at + 42, drawn, 0.0)
-        value -= _C30 * x * (x * x - 3 * y * y) * tl.load(sh_ptr + at + 45, drawn, 0.0)
+        value += _C33 * cubic * tl.load(sh_ptr + offset + 36, visible, 0.0)
+        value -= _C32 * x * four_zz * tl.load(sh_ptr + offset + 39, visible, 0.0)
+        value += _C34 * z * (x * x - y * y) * tl.load(sh_ptr + offset + 42, visible, 0.0)
+        value -= _C30 * x * (x * x - 3 * y * y) * tl.load(sh_ptr + offset + 45, visible, 0.0)
     return tl.maximum(value, 0.0)
 
 
@@ -126,8 +126,8 @@ def project(
     y = r10 * dx + r11 * dy + r12 * dz
     z = r20 * dx + r21 * dy + r22 * dz
     opacity = tl.load(opacities + i, present, 0.0)
-    drawn = present & (z >= near_m) & (z <= _FAR_M) & (opacity >= _ALPHA_MIN)
-    z = tl.where(drawn, z, 1.0)
+    visible = present & (z >= near_m) & (z <= _FAR_M) & (opacity >= _ALPHA_MIN)
+    z = tl.where(visible, z, 1.0)
     fx = tl.load(camera)
     fy = tl.load(camera + 1)
     slope_x = x / z
@@ -146,15 +146,15 @@ def project(
     jy1 = along_y * (r11.to(tl.float32) - sy * r21.to(tl.float32))
     jy2 = along_y * (r12.to(tl.float32) - sy * r22.to(tl.float32))
     f = factors + 9 * i
-    f00 = tl.load(f, drawn, 0.0)
-    f01 = tl.load(f + 1, drawn, 0.0)
-    f02 = tl.load(f + 2, drawn, 0.0)
-    f10 = tl.load(f + 3, drawn, 0.0)
-    f11 = tl.load(f + 4, drawn, 0.0)
-    f12 = tl.load(f + 5, drawn, 0.0)
-    f20 = tl.load(f + 6, drawn, 0.0)
-    f21 = tl.load(f + 7, drawn, 0.0)
-    f22 = tl.load(f + 8, drawn, 0.0)
+    f00 = tl.load(f, visible, 0.0)
+    f01 = tl.load(f + 1, visible, 0.0)
+    f02 = tl.load(f + 2, visible, 0.0)
+    f10 = tl.load(f + 3, visible, 0.0)
+    f11 = tl.load(f + 4, visible, 0.0)
+    f12 = tl.load(f + 5, visible, 0.0)
+    f20 = tl.load(f + 6, visible, 0.0)
+    f21 = tl.load(f + 7, visible, 0.0)
+    f22 = tl.load(f + 8, visible, 0.0)
     m0 = jx0 * f00 + jx1 * f10 + jx2 * f20
     m1 = jx0 * f01 + jx1 * f11 + jx2 * f21
     m2 = jx0 * f02 + jx1 * f12 + jx2 * f22
@@ -181,34 +181,46 @@ def project(
     half_width = extent * tl.sqrt(c11)
     half_height = extent * tl.sqrt(c22)
     distance = tl.sqrt(dx * dx + dy * dy + dz * dz)
-    distance = tl.where(drawn, distance, 1.0)
+    distance = tl.where(visible, distance, 1.0)
     toward_x = (dx / distance).to(tl.float32)
     toward_y = (dy / distance).to(tl.float32)
     toward_z = (dz / distance).to(tl.float32)
     x0, x1 = _tiles(u - half_width - _MARGIN_PX, u + half_width + _MARGIN_PX, tiles_x, TILE)
     y0, y1 = _tiles(v - half_height - _MARGIN_PX, v + half_height + _MARGIN_PX, tiles_y, TILE)
     count = tl.maximum(x1 - x0, 0) * tl.maximum(y1 - y0, 0)
-    count = tl.where(drawn, count, 0)
+    count = tl.where(visible, count, 0)
     slot = block * BLOCK + lane
-    tl.store(depths + slot, tl.where(drawn, z.to(tl.float32), float("inf")))
+    tl.store(depths + slot, tl.where(visible, z.to(tl.float32), float("inf")))
     tl.store(counts + slot, count)
     tl.store(boxes + slot * 4, x0)
     tl.store(boxes + slot * 4 + 1, x1)
     tl.store(boxes + slot * 4 + 2, above + y0)
     tl.store(boxes + slot * 4 + 3, above + y1)
-    seen = count > 0
+    on_screen = count > 0
     record = records + slot * 12
-    tl.store(record, u, seen)
-    tl.store(record + 1, v, seen)
-    tl.store(record + 2, l11, seen)
-    tl.store(record + 3, -(c12 / c22) * l11, seen)
-    tl.store(record + 4, l22, seen)
-    tl.store(record + 5, opacity, seen)
-    at = i * (SIZE * 3)
-    tl.store(record + 6, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 0, SIZE), seen)
-    tl.store(record + 7, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 1, SIZE), seen)
-    tl.store(record + 8, _colour(sh_ptr, at, seen, toward_x, toward_y, toward_z, 2, SIZE), seen)
-    tl.store(record + 9, z.to(tl.float32), seen)
+    tl.store(record, u, on_screen)
+    tl.store(record + 1, v, on_screen)
+    tl.store(record + 2, l11, on_screen)
+    tl.store(record + 3, -(c12 / c22) * l11, on_screen)
+    tl.store(record + 4, l22, on_screen)
+    tl.store(record + 5, opacity, on_screen)
+    sh_offset = i * (SIZE * 3)
+    tl.store(
+        record + 6,
+        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 0, SIZE),
+        on_screen,
+    )
+    tl.store(
+        record + 7,
+        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 1, SIZE),
+        on_screen,
+    )
+    tl.store(
+        record + 8,
+        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 2, SIZE),
+        on_screen,
+    )
+    tl.store(record + 9, z.to(tl.float32), on_screen)
 
 
 @triton.jit
@@ -230,11 +242,11 @@ def list_tiles(
     y0 = tl.load(boxes + slot * 4 + 2, present, 0)
     most = tl.max(count, axis=0)
     for k in range(most):
-        at = begin + k
-        wanted = (k < count) & (at < capacity)
+        slot_in_list = begin + k
+        wanted = (k < count) & (slot_in_list < capacity)
         tile = (y0 + k // columns) * tiles_x + x0 + k % columns
-        tl.store(tiles + at, tile, wanted)
-        tl.store(splats + at, slot.to(tl.int32), wanted)
+        tl.store(tiles + slot_in_list, tile, wanted)
+        tl.store(splats + slot_in_list, slot.to(tl.int32), wanted)
 
 
 @triton.jit
@@ -288,18 +300,18 @@ def composite(
             t = tl.load(record + 4) * dy
             alpha = tl.load(record + 5) * tl.exp(-0.5 * (s * s + t * t))
             alpha = tl.minimum(alpha, _ALPHA_MAX)
-            drawn = (alpha >= _ALPHA_MIN) & open_
+            visible = (alpha >= _ALPHA_MIN) & open_
             after = transmittance * (1.0 - alpha)
             # The splat that would close a pixel is left out, and so is all behind it.
-            open_ = open_ & ~(drawn & (after <= _STOP))
-            drawn = drawn & open_
-            weight = tl.where(drawn, alpha * transmittance, 0.0)
+            open_ = open_ & ~(visible & (after <= _STOP))
+            visible = visible & open_
+            weight = tl.where(visible, alpha * transmittance, 0.0)
             red += weight * tl.load(record + 6)
             green += weight * tl.load(record + 7)
             blue += weight * tl.load(record + 8)
             depth += weight * tl.load(record + 9)
-            transmittance = tl.where(drawn, after, transmittance)
-            last = tl.where(drawn, k + 1 - first, last)
+            transmittance = tl.where(visible, after, transmittance)
+            last = tl.where(visible, k + 1 - first, last)
         begin = stop
         if tl.max(open_.to(tl.int32)) == 0:
             begin = end
@@ -326,8 +338,8 @@ def composite_backward(
     tiles_x,
     TILE: tl.constexpr,
 ):
-    """Walk a tile's splats from the last that was drawn to the nearest, and write what each receives
-    in this tile to its row of ``pairs``: see `gradient_kernels`, whose equations and columns
+    """Walk a tile's splats from the last that was drawn to the nearest, and write the gradient that
+    each receives in this tile to its row of ``pairs``: see `gradient_kernels`, whose equations and columns
     these are.
 
     ``gradients`` holds five numbers per pixel, of colour, weighted depth and opacity; ``places``
@@ -359,18 +371,18 @@ def composite_backward(
         t = tl.load(record + 4) * dy
         full = tl.load(record + 5) * tl.exp(-0.5 * (s * s + t * t))
         alpha = tl.minimum(full, _ALPHA_MAX)
-        drawn = (alpha >= _ALPHA_MIN) & (i < last)
-        if tl.max(drawn.to(tl.int32)) > 0:
+        visible = (alpha >= _ALPHA_MIN) & (i < last)
+        if tl.max(visible.to(tl.int32)) > 0:
             inverse = 1.0 / (1.0 - alpha)
             before = transmittance * inverse
             q = g_alpha + g_depth * tl.load(record + 9)
             q += g_red * tl.load(record + 6)
             q += g_green * tl.load(record + 7)
             q += g_blue * tl.load(record + 8)
-            weight = tl.where(drawn, before * alpha, 0.0)
+            weight = tl.where(visible, before * alpha, 0.0)
             # The clamp of alpha ends the gradient; colour and depth still receive theirs.
-            h = tl.where(drawn & (full <= _ALPHA_MAX), before * q - behind * inverse, 0.0) * alpha
-            transmittance = tl.where(drawn, before, transmittance)
+            h = tl.where(visible & (full <= _ALPHA_MAX), before * q - behind * inverse, 0.0) * alpha
+            transmittance = tl.where(visible, before, transmittance)
             behind += weight * q
             pair = pairs + tl.load(places + begin + i) * 10
             tl.store(pair, tl.sum(weight * g_red))

@@ -43,7 +43,9 @@ class SkyView:
 
 # Of a view that others are asked to complete: the share of the image that it must show. How many
 # views complete it, and how many directions along each side of the image say what a view shows.
-LEAST_COVER, MOST_VIEWS, DIRECTIONS = 0.5, 8, 5
+LEAST_COVER = 0.5
+MOST_VIEWS = 8
+DIRECTIONS = 5
 
 
 class SkyMask:

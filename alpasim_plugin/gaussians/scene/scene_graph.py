@@ -86,10 +86,10 @@ class SceneNode:
         if not clouds:
             return np.zeros(3), 0.0
         # A coordinate at a time: numpy is slow along an axis of three.
-        at = [np.ascontiguousarray(c.means.T) for c in clouds]
+        centres = [np.ascontiguousarray(c.means.T) for c in clouds]
         reach = [3 * np.maximum(np.maximum(*c.scales.T[:2]), c.scales.T[2]) for c in clouds]
-        low = np.min([(m - r).min(axis=1) for m, r in zip(at, reach, strict=True)], axis=0)
-        high = np.max([(m + r).max(axis=1) for m, r in zip(at, reach, strict=True)], axis=0)
+        low = np.min([(m - r).min(axis=1) for m, r in zip(centres, reach, strict=True)], axis=0)
+        high = np.max([(m + r).max(axis=1) for m, r in zip(centres, reach, strict=True)], axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
@@ -264,14 +264,14 @@ class SceneGraph:
     ) -> RasterOutput:
         camera, chosen = view
         nodes: list[Node] = []
-        for one in chosen:
-            prepared = one.node.levels[one.level].prepared
-            if one.antialiased:
+        for choice in chosen:
+            prepared = choice.node.levels[choice.level].prepared
+            if choice.antialiased:
                 prepared = replace(prepared, antialias_px2=MIP_PX2)
-            nodes.append((prepared, one.T_world_node))
+            nodes.append((prepared, choice.T_world_node))
         starts: list[F64 | None] = []
         if camera.rolling is not None:
-            starts = [camera.rolling.actors_start.get(one.node.name) for one in chosen]
+            starts = [camera.rolling.actors_start.get(choice.node.name) for choice in chosen]
         behind = self.sky.image(camera)
         return rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
 
@@ -295,8 +295,8 @@ class SceneGraph:
             for camera, chosen in views
         ]
 
-        def draw(some: Sequence[CloudView]) -> list[DeviceOutput]:
-            return clouds.draw(some, self.sky.on_device([camera for camera, _ in some], device))
+        def draw(batch: Sequence[CloudView]) -> list[DeviceOutput]:
+            return clouds.draw(batch, self.sky.on_device([camera for camera, _ in batch], device))
 
         return batched(placed, lambda view: (view[0].height, view[0].width), draw)
 
@@ -322,14 +322,14 @@ class SceneGraph:
         centres = np.concatenate([background.centre, moved])
         radii = np.concatenate([background.radius, radius])
         distance = np.linalg.norm(centres - camera.centre_world, axis=1) - radii
-        seen = in_view(camera, centres, radii)
+        visible = in_view(camera, centres, radii)
         count = len(background.nodes)
-        seen[:count] &= distance[:count] < background.far_m
+        visible[:count] &= distance[:count] < background.far_m
         nodes = (*background.nodes, *present)
         places = [None] * count + list(poses)
         allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
         chosen = []
-        for i in np.flatnonzero(seen):
+        for i in np.flatnonzero(visible):
             level = _level(nodes[i], float(allowed_m[i]), sharp)
             if level is not None:
                 antialiased = sharp > 0 and nodes[i].is_built
@@ -371,11 +371,11 @@ def _level(node: SceneNode, allowed_m: float, sharp: int) -> int | None:
     """
     least_m = node.usual_cell_m / 2**sharp
     most_m = allowed_m / 2 if sharp and node.is_built else allowed_m
-    own = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
-    fit = [i for i in own if node.levels[i].cell_m <= most_m]
+    level_numbers = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
+    fit = [i for i in level_numbers if node.levels[i].cell_m <= most_m]
     if fit:
         return fit[-1]
-    return own[0] if own else None
+    return level_numbers[0] if level_numbers else None
 
 
 def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
@@ -384,15 +384,15 @@ def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
     """
     p = centre @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     x, y, z = p.T
-    seen = z > -radius
+    visible = z > -radius
     for slope, coordinate, sign in (
         (camera.cx / camera.fx, x, 1.0),
         ((camera.width - camera.cx) / camera.fx, x, -1.0),
         (camera.cy / camera.fy, y, 1.0),
         ((camera.height - camera.cy) / camera.fy, y, -1.0),
     ):
-        seen &= sign * coordinate + slope * z > -radius * np.hypot(1.0, slope)
-    return seen
+        visible &= sign * coordinate + slope * z > -radius * np.hypot(1.0, slope)
+    return visible
 
 
 def _spheres(nodes: Sequence[SceneNode]) -> tuple[F64, F64]:

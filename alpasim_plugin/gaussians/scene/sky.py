@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Kind = Literal["clear", "overcast", "dusk"]
-WIDTH, HEIGHT = 1536, 384  # full turn x elevations from LOW_RAD to HIGH_RAD
+# Full turn x elevations from LOW_RAD to HIGH_RAD
+WIDTH = 1536
+HEIGHT = 384
 LOW_RAD = np.radians(-20.0)
 HIGH_RAD = np.radians(70.0)
 SPAN_PX = np.array([WIDTH, HEIGHT - 1], np.float32)

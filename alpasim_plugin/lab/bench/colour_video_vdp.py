@@ -46,6 +46,7 @@ def load_metric() -> tuple[ColourVideoVDP | None, str]:
     """Return the metric; or None and why there is none: it is not installed, or does not run
     here.
     """
+    # Its own dependencies may not fit the torch that is here
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -56,7 +57,7 @@ def load_metric() -> tuple[ColourVideoVDP | None, str]:
         ImportError,
         OSError,
         RuntimeError,
-    ) as error:  # its own dependencies may not fit the torch that is here
+    ) as error:
         return (
             None,
             f"cvvdp_jod is not measured: {type(error).__name__}: {str(error).splitlines()[0]}; {HOW}",

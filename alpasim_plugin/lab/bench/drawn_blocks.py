@@ -53,8 +53,8 @@ def drawn_blocks(
     def fix() -> Tensor:
         nonlocal state
         # A rollout's first latent holds one frame.
-        shown = image if state.latent else image[:, :, GROUP - 1 :]
-        video, after = pipeline.run(state, shown, shown[:, :1], shown, [noise] * pipeline.draws)
+        render = image if state.latent else image[:, :, GROUP - 1 :]
+        video, after = pipeline.run(state, render, render[:, :1], render, [noise] * pipeline.draws)
         state = pipeline.keep(after)
         return video
 

@@ -26,7 +26,9 @@ from alpasim_plugin.world.ground import height_at
 
 CONTRAST_LEVELS = 18.0  # by which a lane marking is brighter than either side
 WIDEST_M = 0.35
-NEAREST_M, FARTHEST_M = 4.0, 30.0  # of the road that is looked at, along the optical axis
+# Of the road that is looked at, along the optical axis
+NEAREST_M = 4.0
+FARTHEST_M = 30.0
 ASIDE_M = 4.0  # from the recorded path
 SMALLEST_PX = 8  # of a painted spot
 TOLERANCE_PX = 2
@@ -72,12 +74,12 @@ class Road:
     """Where a camera sees the road.
 
     Attributes:
-        seen: ``(H, W)`` bool.
+        mask: Where it sees the road, ``(H, W)`` bool.
         side_px: ``(H,)`` how far, in each row, the road beside a painted pixel is looked at; 0
             where the row shows no road.
     """
 
-    seen: Bool
+    mask: Bool
     side_px: F64
 
 
@@ -101,8 +103,8 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
     down = ray[..., 2] < -1e-3
     for _ in range(3):  # the ground is nearly level: its height where the ray last met it is enough
         depth = np.where(down, (z - eye[2]) / np.where(down, ray[..., 2], -1.0), np.inf)
-        at = eye[:2] + np.where(np.isfinite(depth), depth, 0.0)[..., None] * ray[..., :2]
-        z = height_at(ground, at.reshape(-1, 2)).reshape(u.shape)
+        ground_point = eye[:2] + np.where(np.isfinite(depth), depth, 0.0)[..., None] * ray[..., :2]
+        z = height_at(ground, ground_point.reshape(-1, 2)).reshape(u.shape)
     steps = np.concatenate(
         [
             np.linspace(a, b, 8, endpoint=False)
@@ -110,15 +112,19 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
         ]
         + [path[-1:, :2]]
     )
-    seen = down & (depth > NEAREST_M) & (depth < FARTHEST_M)
-    seen[seen] = (
-        scipy.spatial.KDTree(steps).query(at[seen], distance_upper_bound=ASIDE_M)[0] < ASIDE_M
+    in_reach = down & (depth > NEAREST_M) & (depth < FARTHEST_M)
+    in_reach[in_reach] = (
+        scipy.spatial.KDTree(steps).query(ground_point[in_reach], distance_upper_bound=ASIDE_M)[0]
+        < ASIDE_M
     )
     usual = np.array(
-        [np.median(row[ok]) if ok.any() else np.inf for row, ok in zip(depth, seen, strict=True)]
+        [
+            np.median(row[ok]) if ok.any() else np.inf
+            for row, ok in zip(depth, in_reach, strict=True)
+        ]
     )
     side = np.where(np.isfinite(usual), np.maximum(np.round(camera.fx * WIDEST_M / usual), 2), 0)
-    return Road(np.asarray(seen), np.asarray(side, np.float64))
+    return Road(np.asarray(in_reach), np.asarray(side, np.float64))
 
 
 def paint_of(rgb: U8, road: Road) -> Bool:
@@ -126,7 +132,7 @@ def paint_of(rgb: U8, road: Road) -> Bool:
     bright = rgb[..., :2].astype(np.float64).mean(axis=2)
     out = np.zeros(bright.shape, dtype=bool)
     for row in np.flatnonzero(road.side_px):
-        out[row] = _brighter(bright[row], int(road.side_px[row])) & road.seen[row]
+        out[row] = _brighter(bright[row], int(road.side_px[row])) & road.mask[row]
     count, label, stats, _ = cv2.connectedComponentsWithStats(out.astype(np.uint8), connectivity=8)
     large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= SMALLEST_PX)
     return np.asarray(np.isin(label, large[large > 0])) if count > 1 else out

@@ -34,12 +34,15 @@ from policies.base import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import expand
 
-SUITE, SCENE = "suites/first", 1  # the README's, a winding street
+# The README's, a winding street
+SUITE = "suites/first"
+SCENE = 1
 SIZES = ((512, 288), (256, 144))  # its own, and that of most shipped scenes
 POLICY = "lane-camera"
 STAGES = ("render", "references", "map", "fix", "policy", "control", "actors", "log")
 REFERENCE_SIDE = 768  # of the matrices of the reference work: 0.9 billion floating-point operations
-COMMANDS = {  # what a user waits for -> words of the command
+# What a user waits for -> words of the command
+COMMANDS = {
     "start": ("--help",),
     "one rollout": ("--renderer", "clean", "--policy", POLICY, "--out", "{run}", "smoke/curve"),
     "report": ("report", "{run}"),
@@ -288,11 +291,11 @@ def markdown(record: Mapping[str, Any]) -> str:
         f"| {row['command']} | {row['processor_s']:.2f} | {row['wall_s']:.2f} | {row['ratio']:.0f} |"
         for row in record["commands"]
     ]
-    where = record["machine"]
+    machine = record["machine"]
     used = record["versions"]
     lines += [
         "",
-        f"Reference work: {record['reference_ms']:.2f} ms. {record['scene']}, best of {record['repeats']}; {where['cpu']}, one thread of "
-        f"{where['cores']} cores; numba {used['numba']}, torch {used['torch']}.",
+        f"Reference work: {record['reference_ms']:.2f} ms. {record['scene']}, best of {record['repeats']}; {machine['cpu']}, one thread of "
+        f"{machine['cores']} cores; numba {used['numba']}, torch {used['torch']}.",
     ]
     return "\n".join(lines)

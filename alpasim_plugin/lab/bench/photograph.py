@@ -12,22 +12,22 @@ SIDE_PX = 16
 
 
 def posed_photograph(
-    one: Photograph, width: int, height: int | None = None
+    photograph: Photograph, width: int, height: int | None = None
 ) -> tuple[PinholeCamera, U8]:
     """Read a photograph at sides that are multiples of 16, as fixers need; its height is cut at the
     middle.
 
     Args:
-        one: The photograph.
+        photograph: The photograph.
         width: Pixels across at most, never more than it has.
         height: Pixels down at most; None keeps what there is.
 
     Returns:
         Its camera, and its image ``(H, W, 3)``.
     """
-    whole = photograph_camera(one, min(width, one.width) // SIDE_PX * SIDE_PX)
+    whole = photograph_camera(photograph, min(width, photograph.width) // SIDE_PX * SIDE_PX)
     kept = max(SIDE_PX, min(height or whole.height, whole.height) // SIDE_PX * SIDE_PX)
     top = (whole.height - kept) // 2
     K = whole.K - np.array([[0, 0, 0], [0, 0, top], [0, 0, 0]])
-    image = photograph_image(one, whole)[top : top + kept]
+    image = photograph_image(photograph, whole)[top : top + kept]
     return PinholeCamera(whole.width, kept, K, whole.T_camera_world), np.ascontiguousarray(image)

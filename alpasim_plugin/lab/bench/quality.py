@@ -45,7 +45,7 @@ VERSION = 4  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip
-Given = Literal["render", "truth", "lost-resolution"]  # what the fixers receive
+InputKind = Literal["render", "truth", "lost-resolution"]  # what the fixers receive
 Report = Callable[[int, int, "Work", Mapping[str, Any]], None]
 
 
@@ -77,7 +77,7 @@ class QualityClip:
             yield from self.recorded.warped(len(self.t_us), count, past)
 
 
-def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip:
+def quality_clip(sequence: PairSequence, input_kind: InputKind = "render") -> QualityClip:
     """Return a sequence of pairs as a clip to measure on, its render replaced as ``--input`` says.
 
     Recorded frames are warped by the depth of the degraded render, since pairs hold no other.
@@ -86,11 +86,11 @@ def quality_clip(sequence: PairSequence, given: Given = "render") -> QualityClip
     identity = {**sequence.info, CONTENT: sequence.content}
     render = clip.rgb_input
     opacity = clip.opacity
-    if given != "render":
-        identity["input"] = given
+    if input_kind != "render":
+        identity["input"] = input_kind
         render = clip.rgb_gt
         opacity = np.full_like(clip.opacity, 255)
-    if given == "lost-resolution":
+    if input_kind == "lost-resolution":
         render, opacity = lose_resolution(clip.rgb_gt, sequence.name)
     recorded = open_references(sequence)
     return QualityClip(
@@ -204,7 +204,7 @@ class Work:
 
     Attributes:
         folder: Of the sequence.
-        given: What the fixer receives.
+        input_kind: What the fixer receives.
         variant: Which.
         frames: First frames of the clip that are measured.
         seed: Of the fixer's noise.
@@ -215,7 +215,7 @@ class Work:
     """
 
     folder: Path
-    given: Given
+    input_kind: InputKind
     variant: Variant
     frames: int
     seed: int
@@ -270,10 +270,10 @@ def networks(folder: Path | None) -> dict[str, str]:
 def finish(work: Work) -> dict[str, Any]:
     """Return the row of one clip under one variant, from disk if it is up to date."""
     sequence = PairSequence(work.folder)
-    clip = quality_clip(sequence, work.given).first(work.frames)
+    clip = quality_clip(sequence, work.input_kind).first(work.frames)
     key = row_key(clip, work)
-    shown = shown_frames(len(clip.t_us)) if work.pictured else ()
-    if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in shown):
+    frame_numbers = shown_frames(len(clip.t_us)) if work.pictured else ()
+    if work.row_file.is_file() and all(work.picture_file(i).is_file() for i in frame_numbers):
         stored = read_json(work.row_file)
         if stored["key"] == key:
             return dict(stored["row"])
@@ -289,7 +289,7 @@ def finish(work: Work) -> dict[str, Any]:
             threads=work.threads,
         )
     result = run_variant(clip, work.variant, fixer)
-    for i in shown:
+    for i in frame_numbers:
         _write_png(work.picture_file(i), result.video[i])
     distances = {name: _network(name, work.weights) for name in available(work.weights)}
     row = measure(clip, work.variant, result, work.seed, distances)
@@ -320,7 +320,7 @@ def measure_quality(
     first = works[0]
     summary = summarise(rows, baseline)
     summary["run"] = {
-        "input": first.given,
+        "input": first.input_kind,
         "frames": first.frames,
         "seed": first.seed,
         "device": first.device,
@@ -351,10 +351,10 @@ def write_sheets(works: Sequence[Work], rows: Sequence[Mapping[str, Any]], out: 
     titles: dict[str, list[str]] = {}
     for work, row in zip(works, rows, strict=True):
         if work.pictured:
-            shown = shown_frames(int(row["frames"]))
+            frame_numbers = shown_frames(int(row["frames"]))
             name = work.folder.name
-            titles[name] = [f"frame {i}" for i in shown]
-            images = [_read_png(work.picture_file(i)) for i in shown]
+            titles[name] = [f"frame {i}" for i in frame_numbers]
+            images = [_read_png(work.picture_file(i)) for i in frame_numbers]
             by_clip.setdefault(name, {})[work.variant.label] = images
     for name, columns in by_clip.items():
         _write_png(out / "sheets" / f"{name}.png", sheet(columns, titles[name]))

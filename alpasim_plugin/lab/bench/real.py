@@ -94,27 +94,33 @@ def unseen_cameras(scenario: Scenario) -> list[str]:
 def shots_of(scenario: Scenario) -> dict[str, list[Shot]]:
     """Return all photographs of every camera of `unseen_cameras`, in order of time."""
     path = np.array(
-        [one.T_world_camera[:3, 3] for one in scenario.recording if one.use == "fitted"]
+        [
+            photograph.T_world_camera[:3, 3]
+            for photograph in scenario.recording
+            if photograph.use == "fitted"
+        ]
     )
     taken = {
         name: sorted(
-            (one for one in scenario.recording if one.camera == name), key=lambda one: one.t_us
+            (photograph for photograph in scenario.recording if photograph.camera == name),
+            key=lambda photograph: photograph.t_us,
         )
         for name in unseen_cameras(scenario)
     }
     return {
-        name: [_shot(scenario, one, path) for one in photographs]
+        name: [_shot(scenario, photograph, path) for photograph in photographs]
         for name, photographs in taken.items()
     }
 
 
-def _shot(scenario: Scenario, one: Photograph, path: F64) -> Shot:
+def _shot(scenario: Scenario, photograph: Photograph, path: F64) -> Shot:
     spec = next(
-        (camera for camera in scenario.cameras if camera.name == one.camera), scenario.cameras[0]
+        (camera for camera in scenario.cameras if camera.name == photograph.camera),
+        scenario.cameras[0],
     )
-    camera, rgb = posed_photograph(one, spec.width, spec.height)
+    camera, rgb = posed_photograph(photograph, spec.width, spec.height)
     road = road_of(camera, scenario.ground, scenario.ego_log.xyz)
-    return Shot(one, camera, rgb, _distance(path, one.T_world_camera[:3, 3]), road)
+    return Shot(photograph, camera, rgb, _distance(path, photograph.T_world_camera[:3, 3]), road)
 
 
 def _distance(path: F64, place: F64) -> float:
@@ -147,7 +153,7 @@ def measure_drive(
     Raises:
         InputError: Nothing to measure, or a renderer of blocks of frames.
     """
-    tell = report or (lambda what, done, all: None)
+    tell = report or (lambda subject, done, all: None)
     for make in renderers.values():  # before anything is rendered
         _refuse_blocks(make())
     shots = shots_of(scenario)
@@ -191,16 +197,18 @@ def _rendered(
 
 def request_of(scenario: Scenario, shot: Shot) -> RenderRequest:
     """Return the request of a frame at a photograph's pose and size."""
-    one = shot.photograph
-    T_rig_camera = inverse(interpolate(scenario.ego_log, one.t_us)) @ one.T_world_camera
+    photograph = shot.photograph
+    T_rig_camera = (
+        inverse(interpolate(scenario.ego_log, photograph.t_us)) @ photograph.T_world_camera
+    )
     spec = CameraSpec(
-        one.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera
+        photograph.camera, shot.camera.width, shot.camera.height, shot.camera.K, T_rig_camera
     )
     return RenderRequest(
-        one.t_us,
+        photograph.t_us,
         spec,
-        np.stack([one.T_world_camera, one.T_world_camera]),
-        log_actors(scenario, one.t_us),
+        np.stack([photograph.T_world_camera, photograph.T_world_camera]),
+        log_actors(scenario, photograph.t_us),
     )
 
 
@@ -232,16 +240,16 @@ def _rows(
 
 def _values(taken: Sequence[Shot], made: Sequence[U8], part: Sequence[int], judges: Judges) -> Row:
     truth = np.stack([taken[i].rgb for i in part])
-    shown = np.stack([made[i] for i in part])
+    images = np.stack([made[i] for i in part])
     pairs = [warp_l1(np.stack([made[i - 1], made[i]]))[0] for i in part if i > 0]
     paint = PaintCounts()
     for i in part:
         paint += compare_paint(made[i], taken[i].rgb, taken[i].road)
     return {
-        "psnr_db": _mean([psnr_db(a, b) for a, b in zip(shown, truth, strict=True)]),
-        "ssim": _mean([ssim(a, b) for a, b in zip(shown, truth, strict=True)]),
-        "perceptual_syn": _mean(image_distances(judges.perceptual, shown, truth)),
-        "cvvdp_jod": None if judges.vdp is None else _mean(judges.vdp.jod(shown, truth)),
+        "psnr_db": _mean([psnr_db(a, b) for a, b in zip(images, truth, strict=True)]),
+        "ssim": _mean([ssim(a, b) for a, b in zip(images, truth, strict=True)]),
+        "perceptual_syn": _mean(image_distances(judges.perceptual, images, truth)),
+        "cvvdp_jod": None if judges.vdp is None else _mean(judges.vdp.jod(images, truth)),
         "warp_l1": _mean(pairs),
         "paint_precision": None if paint.precision is None else round(paint.precision, 4),
         "paint_recall": None if paint.recall is None else round(paint.recall, 4),
@@ -260,13 +268,13 @@ def intervals(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """
     out: list[dict[str, Any]] = []
     for renderer, use in dict.fromkeys((row["renderer"], row["set"]) for row in rows):
-        mine = [row for row in rows if (row["renderer"], row["set"]) == (renderer, use)]
+        set_rows = [row for row in rows if (row["renderer"], row["set"]) == (renderer, use)]
         for metric in METRICS:
             values = [
                 value
                 for value in (
-                    _of_drive(mine, drive, metric)
-                    for drive in dict.fromkeys(row["drive"] for row in mine)
+                    _of_drive(set_rows, drive, metric)
+                    for drive in dict.fromkeys(row["drive"] for row in set_rows)
                 )
                 if value is not None
             ]
@@ -295,11 +303,13 @@ def _of_drive(rows: Sequence[Row], drive: object, metric: str) -> float | None:
     """Return a drive's mean of a metric over its rows, by their frames; None where no row has
     it.
     """
-    found = [
+    weighted = [
         (float(row[metric]), float(row["n_frames"]))  # type: ignore[arg-type]
         for row in rows
         if row["drive"] == drive and row[metric] is not None
     ]
     return (
-        float(np.average([v for v, _ in found], weights=[n for _, n in found])) if found else None
+        float(np.average([v for v, _ in weighted], weights=[n for _, n in weighted]))
+        if weighted
+        else None
     )

@@ -67,12 +67,12 @@ def _bytes_of(*parts: Any) -> int:
     return sum(part.nbytes for part in parts if isinstance(part, Tensor))
 
 
-def _counted(call: Callable[[], Any], given: Sequence[Any] = ()) -> tuple[float, float]:
+def _counted(call: Callable[[], Any], inputs: Sequence[Any] = ()) -> tuple[float, float]:
     """Return GFLOP and GB of a call, with the bytes of what it is given and returns."""
     counter = _Counter()
     with counter.flop, counter:
         made = call()
-    moved = counter.bytes + _bytes_of(*given, *made)
+    moved = counter.bytes + _bytes_of(*inputs, *made)
     return round(counter.flop.get_total_flops() / 1e9, 2), round(moved / 1e9, 3)
 
 
@@ -91,9 +91,9 @@ def fixer_work(cameras: int, width: int, height: int) -> Work:
     on_meta = replace(loaded, net=copy.deepcopy(loaded.net).to("meta"), operations=TORCH)
     image = torch.empty((cameras, height, width, 3), dtype=torch.uint8, device="meta")
     references = image.new_empty((cameras, 2, height, width, 4))
-    seen = TORCH.smaller(image, settings.scale_of(height, width))
-    given = GivenFrame(image, *on_meta.net.start(in_range(seen)), None, image, references)
-    return Work(*_counted(lambda: fix_frame(on_meta, settings, given), given))
+    reduced = TORCH.smaller(image, settings.scale_of(height, width))
+    frame = GivenFrame(image, *on_meta.net.start(in_range(reduced)), None, image, references)
+    return Work(*_counted(lambda: fix_frame(on_meta, settings, frame), frame))
 
 
 def blocks(history: str, width: int, height: int, device: str) -> Callable[[], Tensor]:

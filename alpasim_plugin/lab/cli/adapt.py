@@ -51,7 +51,7 @@ def adapt(
     del debug
     if out.exists():
         raise InputError(f"--out {out}: it exists", "name another file, or remove it")
-    progress = options.Progress(updates, every=10)
+    progress = options.Progress(updates, interval=10)
     scenario = load_scenario(str(drive / "scenario.yaml" if drive.is_dir() else drive))
     begin = weights or _shipped()
     done = adapt_to(
@@ -64,11 +64,11 @@ def adapt(
         report=progress.update,
     )
     low, high = done.ci95_db
-    said = f"{done.gain_db:+.2f} dB ({low:+.2f} to {high:+.2f}) over {len(done.after)} held-out photographs"
+    gain_text = f"{done.gain_db:+.2f} dB ({low:+.2f} to {high:+.2f}) over {len(done.after)} held-out photographs"
     verdict = (
-        f"accepted: {said}; wrote {out}"
+        f"accepted: {gain_text}; wrote {out}"
         if done.accepted
-        else f"not accepted: {said}; nothing is written, what you had is kept"
+        else f"not accepted: {gain_text}; nothing is written, what you had is kept"
     )
     if as_json:
         print(json.dumps({**asdict(done), "weights": str(out) if done.accepted else None}))

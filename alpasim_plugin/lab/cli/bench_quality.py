@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, split_names, split_settings
 from alpasim_plugin.lab.bench.quality import (
     RAW,
-    Given,
+    InputKind,
     Variant,
     Work,
     evenly,
@@ -50,8 +50,8 @@ def quality(
         ),
     ] = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
-    given: Annotated[
-        Given,
+    input_kind: Annotated[
+        InputKind,
         typer.Option(
             "--input",
             help="What fixers get: the degraded render; the ground truth, opaque, which they should leave alone; or the truth "
@@ -115,11 +115,13 @@ def quality(
             "name one of the variants",
         )
     sequences = evenly(PairDataset(data, split).sequences, clips)
-    shown = {sequence.name for sequence in evenly(sequences, pictures)} if pictures else set()
+    pictured_names = (
+        {sequence.name for sequence in evenly(sequences, pictures)} if pictures else set()
+    )
     works = [
         Work(
             sequence.folder,
-            given,
+            input_kind,
             variant,
             frames,
             seed,
@@ -127,7 +129,7 @@ def quality(
             threads if jobs == 1 else 1,
             weights_folder(weights),
             out,
-            sequence.name in shown,
+            sequence.name in pictured_names,
         )
         for sequence in sequences
         for variant in (*variants, Variant(TRUTH))
@@ -152,13 +154,13 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
             is not there.
     """
     common: list[str] = []
-    own: dict[str, list[str]] = {}
-    for given in overrides:
-        label, colon, rest = given.partition(":")
+    by_label: dict[str, list[str]] = {}
+    for override in overrides:
+        label, colon, assignment = override.partition(":")
         if colon and not label.startswith("fixer."):
-            own.setdefault(label, []).append(rest)
+            by_label.setdefault(label, []).append(assignment)
         else:
-            common.append(given)
+            common.append(override)
     variants: dict[str, Variant] = {}
     for part in split_names(text):
         label, equals, named = part.partition("=")
@@ -179,11 +181,13 @@ def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:
         settings = (*settings, *in_brackets)
         variants[label] = Variant(
             label,
-            resolve("fixer", name, (*settings, *fixer_overrides([*common, *own.pop(label, [])]))),
+            resolve(
+                "fixer", name, (*settings, *fixer_overrides([*common, *by_label.pop(label, [])]))
+            ),
         )
-    if own or not variants:
+    if by_label or not variants:
         raise InputError(
-            f"--set {next(iter(own), '')}: no fixer of this label",
+            f"--set {next(iter(by_label), '')}: no fixer of this label",
             f"the variants are {', '.join(variants) or 'none'}",
         )
     return tuple(variants.values())

@@ -127,6 +127,6 @@ def _maker(
     return lambda: make_renderer(spec, scenario, seed, device, threads)
 
 
-def _tell(console: Console, drive: str, what: str, done: int, all: int) -> None:
+def _tell(console: Console, drive: str, subject: str, done: int, all: int) -> None:
     if done % EVERY == 0 or done == all:
-        console.print(f"{drive}: {what}: {done}/{all}", highlight=False)
+        console.print(f"{drive}: {subject}: {done}/{all}", highlight=False)

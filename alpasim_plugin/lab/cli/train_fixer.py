@@ -183,7 +183,7 @@ def fixer(
             DecoderRecipe(clips, columns=columns or DecoderRecipe.columns, seed=seed),
             Schedule(steps, peak_lr=lr, warmup=max(steps // 20, 1), ema=ema, save_every=50),
             progress.perceptual_term(metric_weights, device),
-            partial(progress.prepared, every=50),
+            partial(progress.prepared, interval=50),
             progress.update,
             own_size,
             device,
@@ -229,14 +229,14 @@ def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:
     Raises:
         InputError: Not NAME=FILE, or a name twice.
     """
-    found = {} if init is None else {INIT: init}
+    files = {} if init is None else {INIT: init}
     for text in pairs:
         name, equals, path = text.partition("=")
-        if not equals or not path or name in found:
+        if not equals or not path or name in files:
             wrong = "a name that has a file already" if equals and path else "not NAME=FILE"
             raise InputError(
                 f"--weights {text}: {wrong}",
                 "write for example --weights teacher=runs/t/fixer.safetensors",
             )
-        found[name] = Path(path)
-    return found
+        files[name] = Path(path)
+    return files

@@ -136,7 +136,7 @@ def per_frame(
     """
     del debug
     options.use_threads(threads)
-    progress = options.Progress(steps, every=25)
+    progress = options.Progress(steps, interval=25)
     settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides or [])])
     if not isinstance(settings, PixelFixerSettings):
         raise InputError(

@@ -38,7 +38,7 @@ def photographs(
     width: Annotated[
         int, typer.Option("--width", min=16, help="Pixels across, a multiple of 16.")
     ] = 256,
-    every: Annotated[
+    period: Annotated[
         int,
         typer.Option(
             "--every", min=2, help="Hold out every N-th photograph, in N ways: N sequences."
@@ -63,29 +63,31 @@ def photographs(
     console = Console(stderr=True)
     rows = []
     missing: tuple[str, ...] = ()
-    recipe = PhotographRecipe(width, every, steps, split=split, seed=seed)
+    recipe = PhotographRecipe(width, period, steps, split=split, seed=seed)
     named = name or folder.resolve().name
     if (folder / DRIVE_FILE).is_file():
         scenario = load_scenario(str(folder / SCENARIO_FILE))
         made = make_drive_pairs(scenario, named, out, recipe, require_device(device))
     else:
-        found = read_photographs(folder, width)
-        missing = found.missing
-        made = make_photograph_pairs(found, named, out, recipe, require_device(device))
+        posed = read_photographs(folder, width)
+        missing = posed.missing
+        made = make_photograph_pairs(posed, named, out, recipe, require_device(device))
     if missing:
-        shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        examples = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
         console.print(
-            f"{len(missing)} of the listed images are missing: {shown}",
+            f"{len(missing)} of the listed images are missing: {examples}",
             highlight=False,
             markup=False,
         )
-    for one in made:
-        rows.append({"folder": str(one.folder), "made": one.made, "psnr_db": dict(one.psnr_db)})
+    for pairs in made:
+        rows.append(
+            {"folder": str(pairs.folder), "made": pairs.made, "psnr_db": dict(pairs.psnr_db)}
+        )
         quality = ", ".join(
-            f"{key.replace('_', ' ')} {value:.2f} dB" for key, value in one.psnr_db.items()
+            f"{key.replace('_', ' ')} {value:.2f} dB" for key, value in pairs.psnr_db.items()
         )
         console.print(
-            f"{one.folder}{'' if one.made else ' (exists)'}: {quality}",
+            f"{pairs.folder}{'' if pairs.made else ' (exists)'}: {quality}",
             highlight=False,
             markup=False,
             soft_wrap=True,

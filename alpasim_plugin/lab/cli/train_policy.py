@@ -105,7 +105,7 @@ def policy(
         start_from_front(net, load_net(WEIGHTS))
     net = net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     net = net.to(require_device(device))
-    progress = Progress(steps, every=50)
+    progress = Progress(steps, interval=50)
     stages = train(net, demonstrations, out, steps, PolicyRecipe(seed=seed), progress.update)
     net.cpu()
     net.eval()

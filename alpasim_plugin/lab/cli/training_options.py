@@ -104,9 +104,9 @@ class Progress:
         every: Updates between two lines; by default a hundred lines in total.
     """
 
-    def __init__(self, steps: int, every: int | None = None) -> None:
+    def __init__(self, steps: int, interval: int | None = None) -> None:
         self.console, self.steps, self.began = Console(stderr=True), steps, time.time()
-        self.every = every or max(steps // 100, 1)
+        self.interval = interval or max(steps // 100, 1)
 
     def perceptual_term(
         self, metric_weights: Path | None, device: str = "cpu"
@@ -132,14 +132,14 @@ class Progress:
                     highlight=False,
                 )
 
-    def prepared(self, what: str, done: int, count: int, every: int = 10) -> None:
+    def prepared(self, subject: str, done: int, count: int, interval: int = 10) -> None:
         """Report preparation before the first update."""
-        if done == count or done % every == 0:
-            self.console.print(f"{what}: {done}/{count}, {time.time() - self.began:.0f} s")
+        if done == count or done % interval == 0:
+            self.console.print(f"{subject}: {done}/{count}, {time.time() - self.began:.0f} s")
 
     def update(self, step: int, numbers: Mapping[str, float]) -> None:
         """Report an update; ``numbers["s"]`` is its duration in seconds."""
-        if step % self.every == 0 or step == self.steps:
+        if step % self.interval == 0 or step == self.steps:
             values = ", ".join(f"{key} {value:.4g}" for key, value in numbers.items())
             left = (self.steps - step) * numbers["s"]
             self.console.print(

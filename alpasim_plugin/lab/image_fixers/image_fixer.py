@@ -39,9 +39,8 @@ class ImageHistory:
     t_us: int  # of the last
     raw: U8  # (H, W, 3) the last render
     fixed: U8  # (H, W, 3) the last output as generated, also if the guard returned the raw frame
-    references: tuple[
-        U8, ...
-    ]  # (H, W, 3) last outputs as returned, newest first; as many as the network looks at
+    # (H, W, 3) last outputs as returned, newest first; as many as the network looks at
+    references: tuple[U8, ...]
 
 
 class MaplessFixer(Fixer):
@@ -99,11 +98,11 @@ class ImageFixer(MaplessFixer):
             not isinstance(settings, RenderStepSettings | NoiseWindowSettings)
             or settings.is_offline
         ):
-            found = f"settings of type {type(settings).__name__}" + (
+            problem = f"settings of type {type(settings).__name__}" + (
                 " for whole clips" if settings.is_offline else ""
             )
             raise InputError(
-                f"{settings.name}: {found}",
+                f"{settings.name}: {problem}",
                 "take them from fixer_settings(name)",
             )
         self.settings = settings
@@ -194,17 +193,17 @@ class ImageFixer(MaplessFixer):
     def _noise(self, view: Views, clip: Clip, pasts: Sequence[ImageHistory | None]) -> Tensor:
         assert isinstance(self.settings, NoiseWindowSettings)
         shape = (LATENT, clip.rgb.shape[3] // SIDE, clip.rgb.shape[4] // SIDE)
-        drawn = []
+        noise = []
         for camera, past in zip(view.cameras, pasts, strict=True):
             index = 0 if past is None or self.settings.noise == "fixed" else past.frames
-            drawn += latent_noise(
+            noise += latent_noise(
                 self.scene_id, self.seed, [camera], 1, range(index, index + 1), shape
             )
-        return torch.cat(drawn).to(self.networks.device)
+        return torch.cat(noise).to(self.networks.device)
 
     def _continued(
-        self, past: ImageHistory | None, t_us: int, raw: U8, fixed: U8, shown: U8
+        self, past: ImageHistory | None, t_us: int, raw: U8, fixed: U8, displayed: U8
     ) -> ImageHistory:
         count = self.settings.references if isinstance(self.settings, RenderStepSettings) else 0
         frames, references = (0, ()) if past is None else (past.frames, past.references)
-        return ImageHistory(frames + 1, t_us, raw, fixed, (shown, *references)[:count])
+        return ImageHistory(frames + 1, t_us, raw, fixed, (displayed, *references)[:count])

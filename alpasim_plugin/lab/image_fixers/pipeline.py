@@ -84,10 +84,11 @@ def share_embedding(weights: Mapping[str, Tensor], channels: int = 16) -> dict[s
         weights: State dict of `CosmosCausalDiT`; its condition input is replaced.
         channels: Of a latent.
     """
+    # The masks' columns, behind the latents', stay as they are
     latent, columns = (
         weights[LATENT_KEY].clone(),
         channels * AREA,
-    )  # the masks' columns, behind the latents', stay as they are
+    )
     latent[:, :columns] /= 2
     return {**weights, LATENT_KEY: latent, CONDITION_KEY: latent[:, :columns].clone()}
 

@@ -127,10 +127,10 @@ class WindowFixer(MaplessFixer):
         for view in group_views(block, (), WHOLE_CLIP):
             video = self._run(view)
             images = to_images(video, view.size)
-            for b, mine in enumerate(view.index):
+            for b, source_frames in enumerate(view.index):
                 events = guard.check_frames(video[b].transpose(0, 1), images[b], view.rgb[b], None)
                 for t, event in enumerate(events):
-                    i = mine[t]
+                    i = source_frames[t]
                     out[i] = (
                         replace(block[i], events=(*block[i].events, event))
                         if event
@@ -146,15 +146,14 @@ class WindowFixer(MaplessFixer):
         out = torch.empty(len(view.cameras), 3, view.size.frames, *view.shape)
         for index, window in enumerate(parts):
             made = self._sample(view, window, index)
-            begun = (
-                parts[index - 1].stop - window.start if index else 0
-            )  # frames that the windows before reach into this one
+            # Frames that the windows before reach into this one
+            begun = parts[index - 1].stop - window.start if index else 0
             share = torch.from_numpy(
                 fade_in(window, parts[index - 1] if index else None, settings.fade_frames)
             )[:begun, None, None]
-            here = out[:, :, window.start : window.stop]
-            here[:, :, :begun].lerp_(made[:, :, :begun], share)
-            here[:, :, begun:] = made[:, :, begun:]
+            window_frames = out[:, :, window.start : window.stop]
+            window_frames[:, :, :begun].lerp_(made[:, :, :begun], share)
+            window_frames[:, :, begun:] = made[:, :, begun:]
         return out
 
     def _sample(self, view: Views, window: range, index: int) -> Tensor:

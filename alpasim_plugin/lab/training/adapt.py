@@ -35,7 +35,8 @@ from alpasim_plugin.lab.training.pixel_variants import pixel_variant
 from alpasim_plugin.lab.training.streams import StreamShares, TrainingStreams
 from alpasim_plugin.lab.training.trainer import Schedule
 
-FEWEST, ENOUGH = 12, 4  # fitted photographs to train on; held-out ones to measure by
+FEWEST = 12  # fitted photographs to train on
+ENOUGH = 4  # held-out ones to measure by
 WIDTH_PX = 512  # of the photographs, at most
 LR = 2e-4
 WARMUP = 5
@@ -91,10 +92,10 @@ def adapt(
         before = _psnr(held_out, weights, seed)
         trained = _trained(root, weights, updates, distance, seed, report)
         after = _psnr(held_out, trained, seed)
-        found = compared(before, after)
-        if found.accepted:
+        adaptation = compared(before, after)
+        if adaptation.accepted:
             write_bytes(out, read_bytes(trained))
-    return found
+    return adaptation
 
 
 def compared(before: F64, after: F64) -> Adapted:
@@ -113,27 +114,32 @@ def compared(before: F64, after: F64) -> Adapted:
 
 def _pairs(scenario: Scenario, root: Path, seed: int) -> PairSequence:
     """Write the split ``train`` and return the held-out sequence."""
-    camera = next((one.name for one in scenario.cameras), "")
+    camera = next((photograph.name for photograph in scenario.cameras), "")
     taken = sorted(
-        (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
+        (photograph for photograph in scenario.recording if photograph.camera == camera),
+        key=lambda photograph: photograph.t_us,
     )
-    count = {use: sum(one.use == use for one in taken) for use in ("fitted", "held-out")}
+    count = {
+        use: sum(photograph.use == use for photograph in taken) for use in ("fitted", "held-out")
+    }
     if scenario.model is None or count["fitted"] < FEWEST or count["held-out"] < ENOUGH:
         raise InputError(
             f"{scenario.scene_id}: {count['fitted']} fitted and {count['held-out']} held-out photographs of camera {camera!r}",
             f"give an imported drive (simrun import drive) with at least {FEWEST} and {ENOUGH} of them",
         )
-    shots = [Shot.read(one, WIDTH_PX) for one in taken]
+    shots = [Shot.read(photograph, WIDTH_PX) for photograph in taken]
     fitted = [shot for shot in shots if shot.photograph.use == "fitted"]
     held = [shot for shot in shots if shot.photograph.use == "held-out"]
-    for split, shown in (("train", fitted), ("held_out", held)):
+    for split, split_shots in (("train", fitted), ("held_out", held)):
         info: dict[str, Any] = {
             "scene_id": scenario.scene_id,
             "seed": seed,
             "split": split,
             "family": DRIVE,
         }
-        write_drive_sequence(scenario, shown, fitted, root / "pairs" / split / "drive_0", info)
+        write_drive_sequence(
+            scenario, split_shots, fitted, root / "pairs" / split / "drive_0", info
+        )
     return PairSequence(root / "pairs" / "held_out" / "drive_0")
 
 

@@ -140,10 +140,10 @@ class _Reader(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map features ``(B, L, width)`` to the token's ``(B, width)``."""
         token = self.token_norm(self.token).expand(len(x), 1, -1)
-        seen = self.features_norm(x)
+        features = self.features_norm(x)
         q, k, v = (
             layer(y).unflatten(-1, (self.heads, -1))
-            for layer, y in ((self.q, token), (self.k, seen), (self.v, seen))
+            for layer, y in ((self.q, token), (self.k, features), (self.v, features))
         )
         token = token + self.out(attend(self.q_norm(q), self.k_norm(k), v))
         out: Tensor = token + self.ffn(self.inner_norm(token))

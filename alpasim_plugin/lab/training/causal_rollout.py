@@ -55,21 +55,23 @@ def causal_rollout(
     first = 0 if gradient_latents is None else n - gradient_latents
     made = []
     for start in range(0, n, attention.block_latents):
-        own = slice(start, min(start + attention.block_latents, n))
-        with torch.set_grad_enabled(torch.is_grad_enabled() and own.start >= first):
+        block = slice(start, min(start + attention.block_latents, n))
+        with torch.set_grad_enabled(torch.is_grad_enabled() and block.start >= first):
             made.append(
                 _block(
                     net,
-                    [z_1[:, :, own] for z_1 in sources],
+                    [z_1[:, :, block] for z_1 in sources],
                     schedule,
                     text,
-                    condition[:, :, own],
+                    condition[:, :, block],
                     cache,
                 )
             )
         if attention.history == "finalise":
             with torch.no_grad():
-                finalise(net, made[-1], eps_context[:, :, own], text, condition[:, :, own], cache)
+                finalise(
+                    net, made[-1], eps_context[:, :, block], text, condition[:, :, block], cache
+                )
         else:
             cache.commit()
     return torch.cat(made, dim=2)

@@ -24,7 +24,8 @@ OTHERS = ("truck", "cyclist", "pedestrian", "other")
 # levels; distance that rounding causes between a marking's pixel and its colour's line through
 # black
 PAINT_OFF = 1.0
-OFF, OFF_SHARE = 4.0, 0.06  # tolerance of the fit: levels, and share of the pixel's length
+OFF = 4.0  # tolerance of the fit, levels
+OFF_SHARE = 0.06  # further tolerance, a share of the pixel's length
 
 
 def swap_class_colours(sdmap: U8, kind: str) -> U8:
@@ -45,9 +46,8 @@ def swap_class_colours(sdmap: U8, kind: str) -> U8:
             f"class {kind!r}: it has no colours",
             f"choose one of {', '.join(BOX_COLOURS)}",
         )
-    old, new = (
-        np.array(BOX_COLOURS[name], np.float32) for name in (FROM, kind)
-    )  # (2, 3): front, back
+    # (2, 3): front, back
+    old, new = (np.array(BOX_COLOURS[name], np.float32) for name in (FROM, kind))
     out = sdmap.copy()
     inked = sdmap.any(axis=-1)
     pixels = sdmap[inked].astype(np.float32)
@@ -69,9 +69,8 @@ def _paint_distance(pixels: F32) -> F32:
     colours = np.array(list(COLOURS.values()), np.float32)
     directions = colours / np.linalg.norm(colours, axis=1, keepdims=True)
     nearest = np.full(len(pixels), np.inf, np.float32)
-    for (
-        direction
-    ) in directions:  # one at a time: vectorised, it takes 18 times the memory of the map
+    # One at a time: vectorised, it takes 18 times the memory of the map
+    for direction in directions:
         nearest = np.minimum(
             nearest, np.linalg.norm(pixels - np.outer(pixels @ direction, direction), axis=1)
         )

@@ -24,7 +24,7 @@ PATCH = 2  # latents along a side of a token; crops consist of whole tokens
 
 
 @dataclass(frozen=True)
-class Seen:
+class Conditioning:
     """What a network sees: its source and its condition, in training and at deployment.
 
     Args:
@@ -86,9 +86,9 @@ class Drawn(NamedTuple):
         """Return the render ``(B, 3, T, H, W)`` in [-1, 1] and its opacity ``(B, 1, T, H, W)``: the
         clips' frames ``begin`` to ``end``.
         """
-        both = [clip.frames(end, begin) for clip in self.clips]
-        return torch.stack([self._cut(render) for render, _ in both]), torch.stack(
-            [self._cut(opacity) for _, opacity in both]
+        renders = [clip.frames(end, begin) for clip in self.clips]
+        return torch.stack([self._cut(render) for render, _ in renders]), torch.stack(
+            [self._cut(opacity) for _, opacity in renders]
         )
 
     def clean(self, end: int, begin: int = 0) -> Tensor:
@@ -108,12 +108,14 @@ class ClipBatches:
         clips: Training latents.
         vae: Their autoencoder, which encodes the black map.
         form: Number and crop.
-        seen: What the network sees.
+        conditioning: What the network sees.
     """
 
-    def __init__(self, clips: LatentClips, vae: TinyVAE, form: BatchForm, seen: Seen) -> None:
-        self.clips, self.form, self.seen = clips, form, seen
-        self._map = shown_map(seen.map, clips, vae)
+    def __init__(
+        self, clips: LatentClips, vae: TinyVAE, form: BatchForm, conditioning: Conditioning
+    ) -> None:
+        self.clips, self.form, self.conditioning = clips, form, conditioning
+        self._map = shown_map(conditioning.map, clips, vae)
 
     def __getitem__(self, index: int) -> Drawn:
         """Draw batch ``index``: a function of the index and the seed only.
@@ -134,8 +136,8 @@ class ClipBatches:
         b = z_0.shape[0]
         n = z_0.shape[2]
 
-        def normal(what: str) -> Tensor:
-            noise = stream("training", form.seed, f"generator.{what}", index).standard_normal(
+        def normal(name: str) -> Tensor:
+            noise = stream("training", form.seed, f"generator.{name}", index).standard_normal(
                 z_0.shape, dtype=np.float32
             )
             return torch.from_numpy(noise)
@@ -146,21 +148,21 @@ class ClipBatches:
         sample = Sample(
             z_r, z_0, z_map, m, normal("eps"), normal("context"), uniform(), uniform(), w
         )
-        drawn = Drawn(sample, clips, columns)
-        return drawn._replace(sample=self._as_seen(drawn))
+        batch = Drawn(sample, clips, columns)
+        return batch._replace(sample=self._as_seen(batch))
 
-    def _as_seen(self, drawn: Drawn) -> Sample:
+    def _as_seen(self, batch: Drawn) -> Sample:
         """Replace map, mask and condition by what the network sees."""
-        s = drawn.sample
+        s = batch.sample
         condition = s.condition
         m = s.m
         if self._map is not None:
-            condition = self._map[:, : s.z_0.shape[2], :, drawn.columns].expand_as(condition)
-        if self.seen.source == "noise":
+            condition = self._map[:, : s.z_0.shape[2], :, batch.columns].expand_as(condition)
+        if self.conditioning.source == "noise":
             m = torch.zeros_like(m)
             condition = torch.cat([condition, s.z_r], dim=1)
-        if self.seen.opacity:
-            _, opacity = drawn.frames(1 + GROUP * (s.z_0.shape[2] - 1))
+        if self.conditioning.opacity:
+            _, opacity = batch.frames(1 + GROUP * (s.z_0.shape[2] - 1))
             condition = torch.cat([condition, opacity_values(opacity)], dim=1)
         return Sample(s.z_r, s.z_0, condition, m, s.eps, s.eps_context, s.t, s.t_redenoise, s.w)
 

@@ -93,9 +93,8 @@ def to_tensor(frames: U8, flip: bool = False) -> Tensor:
     """Map ``(T, H, W, C)`` uint8 to ``(C, T, H, W)`` float32 in [-1, 1], flipped horizontally if
     asked.
     """
-    array = np.array(
-        frames[:, :, ::-1] if flip else frames
-    )  # a copy, since memory maps are read-only
+    # A copy, since memory maps are read-only
+    array = np.array(frames[:, :, ::-1] if flip else frames)
     return torch.from_numpy(array).permute(3, 0, 1, 2).float() / 127.5 - 1
 
 

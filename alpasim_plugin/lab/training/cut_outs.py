@@ -29,10 +29,10 @@ def cut_out(rng: np.random.Generator, render: Tensor, tries: int = 2) -> Tensor:
     """
     height, width = render.shape[-2:]
     keep = np.ones((len(render), height, width), np.float32)
-    for one in keep:
+    for image_weight in keep:
         for _ in range(tries):
             if rng.random() < CHANCE:
-                one *= 1 - soft_mask(rng, height, width)
+                image_weight *= 1 - soft_mask(rng, height, width)
     return (render + 1) * upload(keep, render.device)[:, None, None] - 1
 
 

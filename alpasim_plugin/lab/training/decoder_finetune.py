@@ -61,7 +61,7 @@ class Rollouts:
         vae: Their autoencoder.
         net: Frozen generator.
         block_latents, window: As at deployment.
-        map: The map that the generator sees, as `Seen.map`.
+        map: The map that the generator sees, as `Conditioning.map`.
         folder: Cache of the rollouts.
         report: Called with the number of clips done and in all.
     """
@@ -82,7 +82,7 @@ class Rollouts:
         self._folder = folder / self.digest
         self._folder.mkdir(parents=True, exist_ok=True)
         text = torch.zeros(1, 1, net.sizes.text_width)
-        shown = shown_map(map, clips, vae)
+        fixed_map = shown_map(map, clips, vae)
         for index in range(len(clips)):
             path = self._path(index)
             if not path.exists():
@@ -90,13 +90,13 @@ class Rollouts:
                 name = f"{clip.sequence.name}.{clip.start}.{clip.mirrored}"
                 eps, context = (
                     torch.from_numpy(
-                        stream(name, 0, f"training.rollout.{what}").standard_normal(
+                        stream(name, 0, f"training.rollout.{purpose}").standard_normal(
                             (1, *clip.z_0.shape), dtype=np.float32
                         )
                     )
-                    for what in ("eps", "context")
+                    for purpose in ("eps", "context")
                 )
-                z_map = clip.z_map if shown is None else shown
+                z_map = clip.z_map if fixed_map is None else fixed_map
                 z_r, m, condition = (z[None] for z in (clip.z_r, clip.m, z_map))
                 z = roll_out(
                     net,
@@ -181,11 +181,10 @@ class DecoderTask:
     def batch(self, index: int) -> DecoderBatch:
         """Make batch ``index``: a function of the index and the recipe's seed only."""
         r = self.recipe
-        rng = stream(
-            "training", r.seed, "painter.clips", index
-        )  # a fixed stream name: it determines the draws
-        drawn = [self._crop(rng) for _ in range(r.clips)]
-        z, render, opacity, clean = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+        # A fixed stream name: it determines the draws
+        rng = stream("training", r.seed, "painter.clips", index)
+        crops = [self._crop(rng) for _ in range(r.clips)]
+        z, render, opacity, clean = (torch.stack(parts) for parts in zip(*crops, strict=True))
         return DecoderBatch(z, render, opacity, clean, int(rng.integers(z.shape[2])))
 
     def loss(self, batch: DecoderBatch, index: int) -> Loss:

@@ -68,8 +68,8 @@ def finetune_decoder(
     vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
     net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
 
-    def tell(what: str) -> Callable[[int, int], None] | None:
-        return None if prepared is None else lambda done, count: prepared(what, done, count)
+    def tell(subject: str) -> Callable[[int, int], None] | None:
+        return None if prepared is None else lambda done, count: prepared(subject, done, count)
 
     clips = LatentClips(
         PairDataset(data, "train", size).sequences,
@@ -78,14 +78,14 @@ def finetune_decoder(
         out.parent / "latents",
         tell("latents"),
     )
-    shown = "drawn" if settings.uses_map else settings.no_map
+    map_kind = "drawn" if settings.uses_map else settings.no_map
     rollouts = Rollouts(
         clips,
         vae,
         net,
         settings.block_latents,
         settings.window,
-        shown,
+        map_kind,
         out.parent / "rollouts",
         tell("rollouts"),
     )
@@ -126,7 +126,7 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
             f"{bundle}: it is for {name}, which has no networks",
             "give a bundle of 'simrun train fixer'",
         )
-    found = [
+    problems = [
         text
         for text, wrong in (
             ("its decoder does not see the render", settings.decoder.kind != "render"),
@@ -140,9 +140,9 @@ def bundle_settings(bundle: Path) -> OneFixerSettings:
         )
         if wrong
     ]
-    if found:
+    if problems:
         raise InputError(
-            f"{bundle}: {'; '.join(found)}",
+            f"{bundle}: {'; '.join(problems)}",
             "give a bundle that 'simrun train fixer' made with a history",
         )
     return settings

@@ -72,12 +72,13 @@ class DemonstrationFacts(TypedDict):
     recipe: Mapping[str, Any]
 
 
+# (N,) row of the frame 0.5 s earlier; the frame itself where there is none
 _FORMS: dict[str, tuple[int, str]] = {
     "frame": (1, "int32"),  # (N,) row in the frames
     "before": (
         1,
         "int32",
-    ),  # (N,) row of the frame 0.5 s earlier; the frame itself where there is none
+    ),
     "yaw": (1, "float32"),  # (N,) radians, yaw perturbation of the view, left positive
     "yaw_before": (1, "float32"),  # (N,)
     "speed": (1, "float32"),  # (N,) metres per second
@@ -273,8 +274,13 @@ def _sample(
 
 def rotated_about_camera(T_world_rig: F64, camera: CameraSpec, yaw_rad: float) -> F64:
     """Return the rig's pose rotated to the left about its camera."""
-    at = se3(camera.T_rig_camera[:3, 3], [1.0, 0.0, 0.0, 0.0])
-    return np.asarray(T_world_rig @ at @ se3([0.0, 0.0, 0.0], quat_from_yaw(yaw_rad)) @ inverse(at))
+    T_rig_pivot = se3(camera.T_rig_camera[:3, 3], [1.0, 0.0, 0.0, 0.0])
+    return np.asarray(
+        T_world_rig
+        @ T_rig_pivot
+        @ se3([0.0, 0.0, 0.0], quat_from_yaw(yaw_rad))
+        @ inverse(T_rig_pivot)
+    )
 
 
 class Demonstrations:
@@ -344,11 +350,11 @@ def common_views(demonstrations: Sequence[Demonstrations]) -> tuple[View, ...]:
         InputError: Some have other views than the rest.
     """
     first = demonstrations[0]
-    for one in demonstrations:
-        if one.views != first.views:
-            have, has = ([view.name for view in each.views] for each in (first, one))
+    for demonstration in demonstrations:
+        if demonstration.views != first.views:
+            have, has = ([view.name for view in each.views] for each in (first, demonstration))
             raise InputError(
-                f"{first.folder} has the views {have}, and {one.folder} {has}",
+                f"{first.folder} has the views {have}, and {demonstration.folder} {has}",
                 "train on scenes whose cameras show the same views",
             )
     return first.views

@@ -109,7 +109,7 @@ class DistillationTask:
 
     def __init__(self, config: Distillation, inputs: StageInputs) -> None:
         self.config, self.inputs, self.attention = config, inputs, inputs.attention
-        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
+        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.conditioning)
         self.student, fake, real = (
             transformer_of(inputs, part) for part in ("dit", "fake", "real")
         )
@@ -166,15 +166,15 @@ class DistillationTask:
         losses: list[Tensor] = []
         if batch.student is not None:
             z = self.roll_out(s, batch.student)
-            loss, found = self._student_loss(z, s, batch.student)
+            loss, parts = self._student_loss(z, s, batch.student)
             losses.append(loss)
-            numbers |= found
+            numbers |= parts
         if z is None or not self.config.same_rollout:
             with torch.no_grad():
                 z = self.roll_out(s, batch.critic)
-        loss, found = self._critic_loss(z.detach(), s, batch.critic)
+        loss, parts = self._critic_loss(z.detach(), s, batch.critic)
         losses.append(loss.double())
-        return torch.stack(losses).sum(), numbers | found
+        return torch.stack(losses).sum(), numbers | parts
 
     def roll_out(self, s: Sample, noise: RolloutNoise) -> Tensor:
         """Return the student's clips, with gradients as `causal_rollout` says."""
@@ -222,9 +222,8 @@ class DistillationTask:
         numbers = {"critic": loss.detach()}
         if term is None:
             return loss, numbers
-        fake = self.parts["head"](
-            self.fake.features
-        )  # of the forward just made, on the noised rollout
+        # Of the forward just made, on the noised rollout
+        fake = self.parts["head"](self.fake.features)
         x_real = noised(s.z_0, n, sigma)
         x_fake = noised(z, n, sigma)
         adversarial, real = term.critic(

@@ -58,9 +58,9 @@ class Shot:
     rgb: U8
 
     @classmethod
-    def read(cls, one: Photograph, width: int) -> Self:
+    def read(cls, photograph: Photograph, width: int) -> Self:
         """Read a photograph at a width in pixels, never larger than it is."""
-        return cls(one, *posed_photograph(one, width))
+        return cls(photograph, *posed_photograph(photograph, width))
 
     def spec(self, scenario: Scenario) -> CameraSpec:
         """Return its camera on the rig."""
@@ -98,9 +98,12 @@ def make_drive_pairs(
         InputError: A camera that took too few photographs.
     """
     points = read_points(Path(str(scenario.model)).parent / POINTS_FILE)
-    for camera in sorted({one.camera for one in scenario.recording if one.use != "never-fitted"}):
+    for camera in sorted(
+        {photograph.camera for photograph in scenario.recording if photograph.use != "never-fitted"}
+    ):
         taken = sorted(
-            (one for one in scenario.recording if one.camera == camera), key=lambda one: one.t_us
+            (photograph for photograph in scenario.recording if photograph.camera == camera),
+            key=lambda photograph: photograph.t_us,
         )
         if len(taken) < 2 * recipe.every:
             raise InputError(
@@ -112,7 +115,7 @@ def make_drive_pairs(
             info = _info(scenario, camera, recipe, phase)
             made = not is_made(folder, info)
             if made:
-                shots = [Shot.read(one, recipe.width) for one in taken]
+                shots = [Shot.read(photograph, recipe.width) for photograph in taken]
                 _write(scenario, shots, points, folder, recipe, phase, info, device)
             yield PhotographPairs(folder, made, PairSequence(folder).info["psnr_db"])
 
@@ -146,13 +149,13 @@ def _write(
     held = [shot for i, shot in enumerate(shots) if i % recipe.every == phase]
     fitted = [shot for i, shot in enumerate(shots) if i % recipe.every != phase]
     with tempfile.TemporaryDirectory(prefix="simrun-pairs-") as scratch:
-        known = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, device)
-        write_drive_sequence(known, held, fitted, folder, info, device)
+        fitted_scenario = _fitted(scenario, fitted, points, Path(scratch), recipe, phase, device)
+        write_drive_sequence(fitted_scenario, held, fitted, folder, info, device)
 
 
 def write_drive_sequence(
     scenario: Scenario,
-    shown: Sequence[Shot],
+    shots: Sequence[Shot],
     recorded: Sequence[Shot],
     folder: Path,
     info: dict[str, Any],
@@ -163,7 +166,7 @@ def write_drive_sequence(
 
     Args:
         scenario: With the model.
-        shown: The frames of the sequence, in order of time.
+        shots: The frames of the sequence, in order of time.
         recorded: Its recording. A photograph that is in both is never its own reference in
             training.
         folder: ROOT/SPLIT/SEQUENCE.
@@ -172,9 +175,9 @@ def write_drive_sequence(
     """
     renderer = make_renderer("3dgs", scenario, int(info["seed"]), device, threads=1)
     geometry: list[FrameGeometry] = []
-    pairs = list(_frames(scenario, shown, renderer, geometry))
+    pairs = list(_frames(scenario, shots, renderer, geometry))
     frames = [_recorded(scenario, shot, renderer) for shot in recorded]
-    lens = shown[0].spec(scenario)
+    lens = shots[0].spec(scenario)
     facts = {
         "width": lens.width,
         "height": lens.height,
@@ -245,15 +248,17 @@ def _frames(
 
 
 def _recorded(scenario: Scenario, shot: Shot, renderer: Renderer) -> RecordedFrame:
-    one = shot.photograph
-    actors = log_actors(scenario, one.t_us)
+    photograph = shot.photograph
+    actors = log_actors(scenario, photograph.t_us)
 
     def read() -> tuple[U8, F32]:
-        T = one.T_world_camera
+        T = photograph.T_world_camera
         depth = renderer.render(
-            RenderRequest(one.t_us, shot.spec(scenario), np.stack([T, T]), actors)
+            RenderRequest(photograph.t_us, shot.spec(scenario), np.stack([T, T]), actors)
         ).depth
         assert depth is not None
         return shot.rgb, depth
 
-    return RecordedFrame(one.t_us, one.camera, shot.camera.K, one.T_world_camera, actors, read)
+    return RecordedFrame(
+        photograph.t_us, photograph.camera, shot.camera.K, photograph.T_world_camera, actors, read
+    )

@@ -26,15 +26,26 @@ from alpasim_plugin.lab.training.reference_store import SequenceReferences, open
 COUNTS = (0.10, 0.15, 0.45, 0.30)  # chance of 0, 1, 2, 3 references
 SLOTS = len(COUNTS) - 1
 USUAL_REFERENCES = 2  # of a bundle's settings; the number is free
-P_SKIP, MOST_SKIPPED = 0.25, 2  # the nearest ones are missing
-P_MISPLACED, SHIFT_M, TURN_RAD = 0.35, 0.06, 0.004  # spread of the error of a recorded frame's pose
-P_EXPOSURE, EXPOSURE = 0.4, 0.08  # spread of the logarithm of a channel's gain
+# The nearest ones are missing
+P_SKIP = 0.25
+MOST_SKIPPED = 2
+# Spread of the error of a recorded frame's pose
+P_MISPLACED = 0.35
+SHIFT_M = 0.06
+TURN_RAD = 0.004
+# Spread of the logarithm of a channel's gain
+P_EXPOSURE = 0.4
+EXPOSURE = 0.08
 P_WRONG = 0.04  # one of them is of another place
 FLOW_FRAMES = (2, 10)  # of a video: how far away the frames are that stand for the recording
-P_BENT, BENT_PX, BENT_CELL_PX = 0.7, 2.0, 24  # error of the flow, smooth over so many pixels
+P_BENT = 0.7
+BENT_PX = 2.0  # error of the flow
+BENT_CELL_PX = 24  # over which it is smooth
 # forward and backward flow agree within this: the neighbouring frame shows the same surface
 CONSISTENT_PX = 1.0
-OPEN_SEQUENCES, PICTURES = 100, 64  # kept in memory
+# Kept in memory
+OPEN_SEQUENCES = 100
+PICTURES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,19 +89,18 @@ def pair_references(
     out = np.zeros(
         (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8
     )
-    found = _opened(sequence)
-    if found is None or not draw.count:
+    opened = _opened(sequence)
+    if opened is None or not draw.count:
         return out
-    references, recorded = found
+    references, recorded = opened
     K = _cropped(references.K, rows, columns)
     last: Sequence[int] = ()
     for t, i in enumerate(index):
         wanted = draw.skipped + draw.count
         t_us = int(references.t_us[i])
         last = recorded.choose(references.T_world_camera[i], t_us, wanted + 1, last)
-        chosen = [j for j in last if references.rgb_t_us[j] != t_us][
-            :wanted
-        ]  # a photograph is not its own reference
+        # A photograph is not its own reference
+        chosen = [j for j in last if references.rgb_t_us[j] != t_us][:wanted]
         target = references.target(int(i), K, rows, columns)
         used = chosen[draw.skipped :]
         places = [
@@ -98,8 +108,8 @@ def pair_references(
             for slot, j in enumerate(used)
         ]
         pictures = [
-            _misplaced(_recorded_image(sequence, at), error)
-            for at, error in zip(places, draw.errors, strict=False)
+            _misplaced(_recorded_image(sequence, place), error)
+            for place, error in zip(places, draw.errors, strict=False)
         ]
         for slot, carried in enumerate(carry(pictures, target, references.T_world_rig(int(i)))):
             out[t, slot] = carried
@@ -111,13 +121,13 @@ def road_users(sequence: PairSequence, index: I64, rows: slice, columns: slice) 
     them: ``(T, h, w)``.
     """
     shape = rows.stop - rows.start, columns.stop - columns.start
-    found = _opened(sequence)
-    if found is None:
+    opened = _opened(sequence)
+    if opened is None:
         return np.zeros((len(index), *shape), dtype=bool)
-    references, _ = found
+    references, _ = opened
     K = _cropped(references.K, rows, columns)
     return np.stack(
-        [on_boxes(shape, references.target(int(i), K, rows, columns).placed.seen) for i in index]
+        [on_boxes(shape, references.target(int(i), K, rows, columns).placed.boxes) for i in index]
     )
 
 
@@ -151,32 +161,32 @@ def video_references(
     return out
 
 
-def _carried(here: U8, there: U8, bent: F32 | None) -> U8:
-    """Carry frame ``there`` to ``here`` by optical flow (Kroeger et al., 2016, DIS)."""
+def _carried(target: U8, source: U8, bent: F32 | None) -> U8:
+    """Carry frame ``source`` to ``target`` by optical flow (Kroeger et al., 2016, DIS)."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # type: ignore[attr-defined]
     grey = [
-        cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (here, there)
+        cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY) for image in (target, source)
     ]
     forward = flow.calc(*grey, None)
     backward = flow.calc(*grey[::-1], None)
     height, width = grey[0].shape
     place = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
-    at = place + forward
+    pixel = place + forward
     back = cv2.remap(
-        backward, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        backward, pixel[..., 0], pixel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     agrees = np.linalg.norm(forward + back, axis=-1) < CONSISTENT_PX
-    seen = (at >= 0).all(-1) & (at[..., 0] <= width - 1) & (at[..., 1] <= height - 1)
-    at = at if bent is None else at + bent
+    inside = (pixel >= 0).all(-1) & (pixel[..., 0] <= width - 1) & (pixel[..., 1] <= height - 1)
+    pixel = pixel if bent is None else pixel + bent
     out = np.empty((height, width, 4), np.uint8)
     out[..., :3] = cv2.remap(
-        np.ascontiguousarray(there),
-        at[..., 0],
-        at[..., 1],
+        np.ascontiguousarray(source),
+        pixel[..., 0],
+        pixel[..., 1],
         cv2.INTER_CUBIC,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    out[..., 3] = np.where(seen, np.where(agrees, VALID, INCONSISTENT), 0)
+    out[..., 3] = np.where(inside, np.where(agrees, VALID, INCONSISTENT), 0)
     return out
 
 
@@ -202,12 +212,12 @@ def _misplaced(picture: RecordedImage, error: F64) -> RecordedImage:
 
 @lru_cache(maxsize=OPEN_SEQUENCES)
 def _opened(sequence: PairSequence) -> tuple[SequenceReferences, ReferenceIndex] | None:
-    found = open_references(sequence)
-    return None if found is None else (found, found.index())
+    references = open_references(sequence)
+    return None if references is None else (references, references.index())
 
 
 @lru_cache(maxsize=PICTURES)
 def _recorded_image(sequence: PairSequence, i: int) -> RecordedImage:
-    found = _opened(sequence)
-    assert found is not None
-    return found[0].picture(i)
+    opened = _opened(sequence)
+    assert opened is not None
+    return opened[0].picture(i)

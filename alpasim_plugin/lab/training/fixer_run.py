@@ -232,7 +232,7 @@ def train_stage(
         "latents": clips.digest,
         "batches": asdict(inputs.form),
         "equal_channels": run.equal_channels,
-        "seen": asdict(stage.seen),
+        "seen": asdict(stage.conditioning),
         "attention": asdict(inputs.attention),
         "distance": distance[0] if distance else "none",
         "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
@@ -286,7 +286,7 @@ def stage_inputs(
         run.settings.dit,
         run.settings.rope_ratios,
         stage.attention(latents),
-        stage.seen,
+        stage.conditioning,
         weights,
         vae,
         clips,
@@ -389,11 +389,11 @@ def deployed_settings(run: FixerRun, stage: Stage) -> TrainableSettings:
     Raises:
         InputError: Settings that do not fit together.
     """
-    said = stage.deployed
+    changes = stage.deployed
     if isinstance(run.settings, OneFixerSettings):
-        said = run.recipe.settings(stage, clip_latents(run, stage))
+        changes = run.recipe.settings(stage, clip_latents(run, stage))
     try:
-        return type(run.settings).model_validate({**run.settings.model_dump(), **said})
+        return type(run.settings).model_validate({**run.settings.model_dump(), **changes})
     except ValueError as error:
         raise InputError(
             f"{run.recipe.name}, stage {stage.name}: {error}",

@@ -71,7 +71,7 @@ class FlowMatchingTask:
     def __init__(self, config: FlowMatching, inputs: StageInputs) -> None:
         self.config = config
         self.attention = inputs.attention
-        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
+        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.conditioning)
         self.net = transformer_of(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": inputs.vae})
         self.channel_weights = channel_weights_of(inputs)
@@ -83,11 +83,11 @@ class FlowMatchingTask:
 
     def batch(self, index: int) -> Sample:
         """Make batch ``index``."""
-        drawn: Drawn = self.batches[index]
+        draw: Drawn = self.batches[index]
         return (
-            drawn.sample
+            draw.sample
             if self.config.tail_drop is None
-            else self.config.tail_drop(drawn.sample, self.batches.form.seed, index)
+            else self.config.tail_drop(draw.sample, self.batches.form.seed, index)
         )
 
     def loss(self, batch: Sample, index: int) -> Loss:
@@ -153,9 +153,8 @@ def noise_levels(
     n = s.t.shape[1]
     size = {"latent": 1, "block": attention.block_latents, "clip": n}[config.times]
     device = s.t.device
-    first = (
-        torch.arange(n, device=device) // size * size
-    )  # latents of a block or clip share the draw of its first
+    # Latents of a block or clip share the draw of its first
+    first = torch.arange(n, device=device) // size * size
     t = s.t[:, first]
     t = config.shift * t / (1 + (config.shift - 1) * t) if config.shift != 1 else t
     rng = stream("training", seed, "generator.levels", index)

@@ -70,14 +70,14 @@ def check_scenes(folder: Path, record: Path = RECORD) -> dict[str, FrozenSplit]:
     """
     do_this = "give the record that ships: configs/fixers/test-scenes.json"
     entries = read_json_as(dict[str, FrozenEntry], record, do_this=do_this)
-    known = {split: FrozenSplit(**entry) for split, entry in entries.items()}
-    for split, frozen in known.items():
-        found = hash_scenes(folder / split)
-        differ = sorted({name for name, _ in frozen.scenes.items() ^ found.scenes.items()})
-        if differ or found.sha256 != frozen.sha256:
-            shown = ", ".join(differ[:5]) or "the hash of all scenes"
+    recorded = {split: FrozenSplit(**entry) for split, entry in entries.items()}
+    for split, frozen in recorded.items():
+        hashes = hash_scenes(folder / split)
+        differ = sorted({name for name, _ in frozen.scenes.items() ^ hashes.scenes.items()})
+        if differ or hashes.sha256 != frozen.sha256:
+            examples = ", ".join(differ[:5]) or "the hash of all scenes"
             raise InputError(
-                f"{folder / split} against {record}: {max(len(differ), 1)} differ: {shown}",
+                f"{folder / split} against {record}: {max(len(differ), 1)} differ: {examples}",
                 f"write the scenes again with 'simrun train scenes --split {split}', into an empty folder",
             )
-    return known
+    return recorded

@@ -99,7 +99,7 @@ class SharedRolloutTask:
                 "give one",
             )
         self.config, self.inputs, self.vae = config, inputs, inputs.vae
-        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
+        self.batches = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.conditioning)
         self.net = transformer_of(inputs, "dit")
         self.parts = nn.ModuleDict({"dit": self.net, "vae": self.vae})
         self.channel_weights = channel_weights_of(inputs)
@@ -118,11 +118,11 @@ class SharedRolloutTask:
 
     def batch(self, index: int) -> RolloutBatch:
         """Make batch ``index``."""
-        drawn = self.batches[index]
+        draw = self.batches[index]
         render = opacity = None
         if self.objectives(index).horizon:
-            render, opacity = drawn.frames(1 + GROUP * drawn.sample.w)
-        return RolloutBatch(drawn.sample, render, opacity)
+            render, opacity = draw.frames(1 + GROUP * draw.sample.w)
+        return RolloutBatch(draw.sample, render, opacity)
 
     def loss(self, batch: RolloutBatch, index: int) -> Loss:
         """Return the loss of a batch and its parts."""

@@ -44,9 +44,8 @@ class LostResolution:
         """Return frames ``(T, 3, h, w)`` in [-1, 1], damaged; black shows through the holes."""
         height, width = self.opacity.shape
         coarse = (max(width // self.cell_px, 1), max(height // self.cell_px, 1))
-        out = np.empty(
-            frames.shape, frames.dtype
-        )  # in C order, whatever the frames' own is: the loop writes into a view of it
+        # In C order, whatever the frames' own is: the loop writes into a view of it
+        out = np.empty(frames.shape, frames.dtype)
         for image, made in zip(
             frames.reshape(-1, height, width), out.reshape(-1, height, width), strict=True
         ):

@@ -23,11 +23,9 @@ CHANCES: dict[Kind, float] = {
     "shifted": 0.12,
     "other": 0.06,
 }
-SHIFT_PX, TURN_DEG, ZOOM = (
-    (8.0, 3.0),
-    1.5,
-    0.03,
-)  # spread along x and y, at 256 pixels across; of the turn; of the scale's logarithm
+SHIFT_PX = (8.0, 3.0)  # spread along x and y, at 256 pixels across
+TURN_DEG = 1.5  # of the turn
+ZOOM = 0.03  # of the scale's logarithm
 PAINT = ("line_untyped", "line_white", "line_yellow", "line_other")
 ALIKE = 0.985  # cosine between a pixel's colour and that of lane markings, at any brightness
 
@@ -84,8 +82,8 @@ def is_paint(sdmap: U8) -> Bool:
     """Return which pixels of maps ``(..., H, W, 3)`` show lane markings, at any brightness."""
     colour = sdmap.astype(np.float32)
     length = np.linalg.norm(colour, axis=-1)
-    paint = np.array([COLOURS[name] for name in PAINT], np.float32)
-    paint /= np.linalg.norm(paint, axis=1, keepdims=True)
-    alike = (colour @ paint.T).max(axis=-1) > ALIKE * length
-    found: Bool = alike & (length > 0)
-    return found
+    paint_colours = np.array([COLOURS[name] for name in PAINT], np.float32)
+    paint_colours /= np.linalg.norm(paint_colours, axis=1, keepdims=True)
+    alike = (colour @ paint_colours.T).max(axis=-1) > ALIKE * length
+    painted: Bool = alike & (length > 0)
+    return painted

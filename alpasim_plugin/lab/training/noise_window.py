@@ -22,7 +22,9 @@ from torch import Tensor
 from alpasim_plugin.block_fixers.dit import CosmosCausalDiT, TextContext
 from alpasim_plugin.fixers.network.schedule import TABLE, interpolant
 
-LOG_MEAN, LOG_STD = 0.7, 1.6  # of s, as SVD's training has them
+# Of s, as SVD's training has them
+LOG_MEAN = 0.7
+LOG_STD = 1.6
 Error = Callable[[Tensor, Tensor], Tensor]  # v_hat - v (B, C, T, H, W), t (B,) -> the same shape
 
 
@@ -43,9 +45,9 @@ def seen_latents(rng: np.random.Generator, shape: tuple[int, int], dropout: floa
     """Draw which latents of windows ``(B, T)`` keep their condition; the first and the last always
     do.
     """
-    seen = rng.random(shape) >= dropout
-    seen[:, [0, -1]] = True
-    return torch.from_numpy(seen)
+    keeps_condition = rng.random(shape) >= dropout
+    keeps_condition[:, [0, -1]] = True
+    return torch.from_numpy(keeps_condition)
 
 
 def squared_error(error: Tensor, t: Tensor) -> Tensor:

@@ -64,14 +64,14 @@ class NoiseWindowLoss:
 
 
 class NoiseWindowBatch(NamedTuple):
-    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)``, times ``(B,)`` and
-    seen conditions ``(B, latents)``.
+    """Frames of windows with their noise ``(B, 16, latents, H / 8, W / 8)``, times ``(B,)``, and
+    which latents keep their condition ``(B, latents)``.
     """
 
     pictures: Pictures
     eps: Tensor
     t: Tensor
-    seen: Tensor
+    keeps_condition: Tensor
 
 
 class NoiseWindowTask:
@@ -138,7 +138,7 @@ class NoiseWindowTask:
         """Return the loss of a batch."""
         with torch.no_grad():
             z_r, z_0 = self.vae.encode(torch.cat(batch.pictures)).chunk(2)
-            z_r = z_r * batch.seen[:, None, :, None, None]
+            z_r = z_r * batch.keeps_condition[:, None, :, None, None]
         errors = noise_window_errors(
             self.net,
             z_0,

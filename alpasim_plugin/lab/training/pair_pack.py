@@ -40,7 +40,9 @@ PACKED = "packed"
 LIMIT_BYTES = 40_000_000
 ENTRY_BYTES = 300  # of a file's entries in the archive, at most
 CRF = 33  # of the encoder
-NEAREST_M, OCTAVES = 0.25, 12.0  # depths from a quarter of a metre to a kilometre
+# Depths from a quarter of a metre to a kilometre
+NEAREST_M = 0.25
+OCTAVES = 12.0
 MAKE = "make it with 'simrun train pairs --pack'"
 
 
@@ -83,11 +85,11 @@ def write_pack(folders: Sequence[Path], path: Path, limit_bytes: int = LIMIT_BYT
             infos.append(info)
         if not infos:
             raise InputError(f"{path}: room for none of {len(folders)} sequences", MAKE)
-    found = [info[PACKED]["psnr_db"] for info in infos]
+    psnrs = [info[PACKED]["psnr_db"] for info in infos]
     means = {
-        name: round(float(np.mean([one[name] for one in found if name in one])), 2)
+        name: round(float(np.mean([one[name] for one in psnrs if name in one])), 2)
         for name in (*IMAGES, *SHARES)
-        if any(name in one for one in found)
+        if any(name in one for one in psnrs)
     }
     frames = sum(info["frames"] for info in infos)
     left_out = len(folders) - len(infos)
@@ -106,8 +108,11 @@ def unpack(path: Path, folder: Path) -> Path:
     with parsing(path, MAKE, "no pack of training pairs"), zipfile.ZipFile(path) as archive:
         names = archive.namelist()
         for name in names:
-            split, sequence, *rest = name.split("/")
-            if rest == [SEQUENCE_FILE] and not (folder / split / sequence / SEQUENCE_FILE).exists():
+            split, sequence, *parts = name.split("/")
+            if (
+                parts == [SEQUENCE_FILE]
+                and not (folder / split / sequence / SEQUENCE_FILE).exists()
+            ):
                 start = f"{split}/{sequence}/"
                 if ".." in (split, sequence) or os.path.isabs(name):
                     raise ValueError(f"the name {name}")
@@ -126,7 +131,7 @@ def _coded(folder: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Return the files of a sequence in a pack, and its facts."""
     info = dict(parse_json((folder / SEQUENCE_FILE).read_text(), folder))
     shapes: dict[str, list[int]] = {}
-    found: dict[str, float] = {}
+    psnr_of_file: dict[str, float] = {}
     files: dict[str, bytes] = {}
     for path in sorted(folder.rglob("*.npy")):
         name = path.relative_to(folder).with_suffix("").as_posix()
@@ -139,8 +144,8 @@ def _coded(folder: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
         files[f"{name}.mp4"] = coded
         shapes[name] = list(array.shape)
         if name not in DEPTHS:
-            found[name] = psnr_db(_images(coded, array.shape), array)
-    info[PACKED] = {"shapes": shapes, "psnr_db": found}
+            psnr_of_file[name] = psnr_db(_images(coded, array.shape), array)
+    info[PACKED] = {"shapes": shapes, "psnr_db": psnr_of_file}
     files[SEQUENCE_FILE] = json.dumps(info).encode()
     return files, info
 

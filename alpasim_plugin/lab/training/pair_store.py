@@ -191,7 +191,7 @@ class PairDataset:
 
     def refresh(self) -> None:
         """Find new sequences."""
-        known = {s.name: s for s in self.sequences}
+        by_name = {s.name: s for s in self.sequences}
         finished = sorted(
             p.parent
             for p in self.folder.glob(f"*/{SEQUENCE_FILE}")
@@ -202,7 +202,7 @@ class PairDataset:
                 f"{self.folder}: no finished sequence",
                 "make some with 'simrun train pairs'",
             )
-        complete = tuple(known.get(f.name) or PairSequence(f) for f in finished)
+        complete = tuple(by_name.get(f.name) or PairSequence(f) for f in finished)
         self.sequences = tuple(s for s in complete if self.size in (None, s.size))
         if self.size is not None and not self.sequences:
             raise InputError(

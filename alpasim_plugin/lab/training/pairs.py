@@ -181,7 +181,7 @@ def _camera(scenario: Scenario, name: str | None) -> CameraSpec:
     for camera in scenario.cameras:
         if name is None or camera.name == name:
             return camera
-    known = sorted(c.name for c in scenario.cameras)
+    names = sorted(c.name for c in scenario.cameras)
     raise InputError(
-        f"camera {name!r}: scene {scenario.scene_id!r} has {known}", "name one of them"
+        f"camera {name!r}: scene {scenario.scene_id!r} has {names}", "name one of them"
     )

@@ -33,10 +33,9 @@ from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.route import LaneIndex
 
 FRAME_INTERVAL_S = 0.5  # between two frames; the earlier one shows the motion of other road users
-MAX_OFFSET_M, MAX_OFFSET_NEIGHBOUR_M = (
-    1.8,
-    1.3,
-)  # with a neighbouring lane the nearest lane must not change
+# With a neighbouring lane the nearest lane must not change
+MAX_OFFSET_M = 1.8
+MAX_OFFSET_NEIGHBOUR_M = 1.3
 LEADER_SHARE = 0.55  # share of rollouts with a synthetic leader
 KEPT = ("crosses", "beside")  # actors that drive as recorded: the ego gives way to them
 LOOKS_SHARE = 0.5  # share of rollouts in which the driver gives way to who comes from a side
@@ -182,7 +181,7 @@ def _drive(
             states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
         most = following_acceleration(v, ahead, driven_style)
         if looks:
-            most = min(most, others.acceleration(t, s, v, driven_style, others.seen(t, s)))
+            most = min(most, others.acceleration(t, s, v, driven_style, others.in_sight(t, s)))
         if brakes_s < step * STEP_S < brakes_until_s:
             most = min(most, -brakes_mps2)
         wanted = acceleration(line, s, v, most, driven_style)
@@ -262,11 +261,11 @@ def _collides(scenario: Scenario, T_world_rig: F64, bodies: Bodies, margin_m: fl
     ):
         if np.hypot(*(xy - centre)) > length + half[0] + 3.0:
             continue
-        for at, angle, extent, other, other_angle, other_extent in (
+        for middle, angle, extent, other, other_angle, other_extent in (
             (xy, yaw, np.array([length, width]), centre, yaw_of(T_world_rig), half),
             (centre, yaw_of(T_world_rig), half, xy, yaw, np.array([length, width])),
         ):
-            points = at + (grid * extent) @ _rotation(angle).T
+            points = middle + (grid * extent) @ _rotation(angle).T
             local = (points - other) @ _rotation(other_angle)
             if (np.abs(local) < other_extent).all(axis=1).any():
                 return True

@@ -117,10 +117,10 @@ def make_photograph_pairs(
         if made:
             matched = matches(photographs.views) if matched is None else matched
             graph = _fitted(photographs, matched, recipe, phase, name, device)
-            shown = [graph.render(view.camera, {}, 1, device) for view in photographs.views]
+            renders = [graph.render(view.camera, {}, 1, device) for view in photographs.views]
             images = [
-                (one.to_uint8(), np.rint(one.alpha * 255).clip(0, 255).astype(np.uint8))
-                for one in shown
+                (render.to_uint8(), np.rint(render.alpha * 255).clip(0, 255).astype(np.uint8))
+                for render in renders
             ]
             psnr = _psnr(photographs, [image for image, _ in images], set(info["held_out"]))
             write_sequence(
@@ -157,7 +157,7 @@ def _info(
 
 def _fitted(
     photographs: Photographs,
-    found: list[Match],
+    matches: list[Match],
     recipe: PhotographRecipe,
     phase: int,
     name: str,
@@ -165,7 +165,7 @@ def _fitted(
 ) -> SceneGraph:
     used = [i for i in range(len(photographs.views)) if i % recipe.every != phase]
     rng = stream(f"photographs-{name}", recipe.seed, "photographs.start", phase)
-    start = triangulated(photographs.views, found, used, recipe.points, rng)
+    start = triangulated(photographs.views, matches, used, recipe.points, rng)
     views = [resized(photographs.views[i], min(FITTED_PX, recipe.width)) for i in used]
     scene_id = f"photographs-{name}"
     return fit(views, start, recipe.splat(), scene_id=scene_id, threads=1, device=device).graph()

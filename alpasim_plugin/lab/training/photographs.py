@@ -61,12 +61,14 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
             f"choose for example {16 * SIDE_PX}",
         )
     _, pictures = read_posed_photographs(folder, "opengl")
-    there, missing = present(folder, pictures)
-    there = sorted(there, key=lambda one: one.camera or "")  # camera by camera, as files list them
-    poses = _scaled(np.array([picture.T_world_camera for picture in there]))
+    pictures_on_disk, missing = present(folder, pictures)
+    pictures_on_disk = sorted(
+        pictures_on_disk, key=lambda photograph: photograph.camera or ""
+    )  # camera by camera, as files list them
+    poses = _scaled(np.array([picture.T_world_camera for picture in pictures_on_disk]))
     views = [
-        _cut(replace(one, T_world_camera=pose).view(), width, one.where)
-        for one, pose in zip(there, poses, strict=True)
+        _cut(replace(photograph, T_world_camera=pose).view(), width, photograph.location)
+        for photograph, pose in zip(pictures_on_disk, poses, strict=True)
     ]
     return Photographs(tuple(views), missing, len(pictures))
 
@@ -80,14 +82,14 @@ def _scaled(poses: F64) -> F64:
     return out
 
 
-def _cut(view: PosedView, width: int, where: str) -> PosedView:
+def _cut(view: PosedView, width: int, location: str) -> PosedView:
     """Reduce a view to a width, and cut its height at the middle to a multiple of `SIDE_PX`."""
     small = resized(view, width)
     height = small.camera.height
     kept = height // SIDE_PX * SIDE_PX
     if kept < SIDE_PX:
         raise InputError(
-            f"{where}: {height} pixels high at {width} across", "choose a larger width"
+            f"{location}: {height} pixels high at {width} across", "choose a larger width"
         )
     top = (height - kept) // 2
     K = small.camera.K.copy()
@@ -98,7 +100,7 @@ def _cut(view: PosedView, width: int, where: str) -> PosedView:
 
 def triangulated(
     views: Sequence[PosedView],
-    found: Sequence[Match],
+    matches: Sequence[Match],
     used: Sequence[int],
     most: int,
     rng: np.random.Generator,
@@ -107,7 +109,7 @@ def triangulated(
 
     Args:
         views: That were matched.
-        found: Their matches.
+        matches: Their matches.
         used: Indices of the views that may be looked at; matches with others are left out.
         most: Points at most, drawn from all.
         rng: Draws them.
@@ -117,14 +119,14 @@ def triangulated(
     """
     may = set(used)
     parts: list[tuple[F64, F64]] = []
-    pairs = sorted({(m.first, m.second) for m in found if m.first in may and m.second in may})
+    pairs = sorted({(m.first, m.second) for m in matches if m.first in may and m.second in may})
     for i, j in pairs:
-        mine = [m for m in found if (m.first, m.second) == (i, j)]
-        a = np.array([m.at_first for m in mine])
-        b = np.array([m.at_second for m in mine])
+        pair_matches = [m for m in matches if (m.first, m.second) == (i, j)]
+        a = np.array([m.at_first for m in pair_matches])
+        b = np.array([m.at_second for m in pair_matches])
         place, good = _triangulate(views[i].camera, views[j].camera, a, b)
-        at = a[good].astype(np.int64)
-        parts.append((place[good], views[i].rgb[at[:, 1], at[:, 0]] / 255.0))
+        pixels = a[good].astype(np.int64)
+        parts.append((place[good], views[i].rgb[pixels[:, 1], pixels[:, 0]] / 255.0))
     points = np.concatenate([np.zeros((0, 3)), *(place for place, _ in parts)])
     colours = np.concatenate([np.zeros((0, 3)), *(rgb for _, rgb in parts)])
     count = len(points)
@@ -146,11 +148,12 @@ def _triangulate(first: PinholeCamera, second: PinholeCamera, a: F64, b: F64) ->
     w = np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
     points = (homogeneous[:3] / w).T
     good = np.ones(len(points), dtype=bool)
-    for camera, at in ((first, a), (second, b)):
+    for camera, observed in ((first, a), (second, b)):
         local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
         pixel = local @ camera.K.T
         error = np.linalg.norm(
-            pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - at, axis=1
+            pixel[:, :2] / np.where(np.abs(local[:, 2:]) < 1e-9, 1e-9, local[:, 2:]) - observed,
+            axis=1,
         )
         good &= (local[:, 2] > 1e-3) & (error < LARGEST_ERROR_PX)
     rays = [points - camera.centre_world for camera in (first, second)]

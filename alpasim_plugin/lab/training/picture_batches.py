@@ -42,7 +42,7 @@ class PictureBatches:
             )
         self.frames = frames
         self._latest = have - frames
-        self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.seen)
+        self._clips = ClipBatches(inputs.clips, inputs.vae, inputs.form, inputs.conditioning)
         self.seed = inputs.form.seed
 
     def __getitem__(self, index: int) -> Pictures:
@@ -50,6 +50,6 @@ class PictureBatches:
         begin = int(
             stream("training", self.seed, "pictures.begin", index).integers(self._latest + 1)
         )
-        drawn = self._clips[index]
+        draw = self._clips[index]
         end = begin + self.frames
-        return Pictures(drawn.frames(end, begin)[0], drawn.clean(end, begin))
+        return Pictures(draw.frames(end, begin)[0], draw.clean(end, begin))

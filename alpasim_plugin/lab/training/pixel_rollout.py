@@ -35,10 +35,8 @@ from alpasim_plugin.lab.training.grid_term import grid_term
 
 History = Literal["own", "clean", "redenoised"]
 Distance = Callable[[Tensor, Tensor], Tensor]  # images (F, 3, H, W) in [-1, 1], twice -> (F,)
-NEAR, AROUND = (
-    0.02,
-    5,
-)  # s of the choice term, of a range of 2; pixels of the side over which errors are averaged
+NEAR = 0.02  # s of the choice term, of a range of 2
+AROUND = 5  # pixels of the side over which errors are averaged
 ROAD_USER = 4  # a policy looks at road users, who are few pixels
 EARLIEST = 0.3  # times below it count as this one in the weight 1 / t of the flow term
 
@@ -50,8 +48,10 @@ def detached(state: PixelState) -> PixelState:
 
 def restarted(state: PixelState, fresh: Tensor, start: PixelState) -> PixelState:
     """Return the state with the clips that ``fresh`` ``(B,)`` marks taken from ``start``."""
-    at = fresh[:, None, None, None]
-    return PixelState(*(torch.where(at, new, old) for new, old in zip(start, state, strict=True)))
+    restart_mask = fresh[:, None, None, None]
+    return PixelState(
+        *(torch.where(restart_mask, new, old) for new, old in zip(start, state, strict=True))
+    )
 
 
 @dataclass(frozen=True)
@@ -211,9 +211,8 @@ def pixel_losses(
     weight = torch.ones_like(sample.opacity)
     if sample.road_users is not None:
         weight = weight + (ROAD_USER - 1) * sample.road_users
-    weight = weight / weight.mean(
-        dim=tuple(range(1, weight.ndim)), keepdim=True
-    )  # row by row: the loss of rows is the mean of theirs
+    # Row by row: the loss of rows is the mean of theirs.
+    weight = weight / weight.mean(dim=tuple(range(1, weight.ndim)), keepdim=True)
     picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
     temporal = (weight[:, 1:] * moved.abs()).mean() if objectives.temporal and frames > 1 else zero

@@ -109,8 +109,8 @@ def train_per_frame(
     path = write_bundle(run, out / BUNDLE_FILE, trainer.averaged(), trainer.step)
     rows, hours = curves(out / LOG_FILE)
     training = {"schedule": asdict(run.schedule), "updates": trainer.step, **facts}
-    what = f"per-frame generator, {trainer.step} updates"
-    ModelCard(what, dict(run.streams.facts()), training, rows, hours).write(path)
+    model = f"per-frame generator, {trainer.step} updates"
+    ModelCard(model, dict(run.streams.facts()), training, rows, hours).write(path)
     return path
 
 
@@ -136,29 +136,31 @@ def initial_generator(run: PixelRun) -> PixelGenerator:
             f"{run.init}: no part generator.*",
             "give a checkpoint or a bundle of 'simrun train per-frame'",
         )
-    own = net.state_dict()
+    fresh = net.state_dict()
     lacking = {
         key
-        for key in own.keys() - tensors.keys()
+        for key in fresh.keys() - tensors.keys()
         if key.startswith(("blend.", "finer.")) or BLOCK.match(key)
     }
     wrong = sorted(
         key
-        for key in (tensors.keys() | own.keys()) - lacking
-        if not _fits(tensors.get(key), own.get(key))
+        for key in (tensors.keys() | fresh.keys()) - lacking
+        if not _fits(tensors.get(key), fresh.get(key))
     )
     if wrong:
         raise InputError(
             f"{run.init}: {len(wrong)} tensors of other sizes than {net.facts}, such as {wrong[0]}",
             "choose the fixer of the same widths",
         )
-    identity = {key: torch.zeros_like(own[key]) for key in lacking if key.endswith("second.weight")}
-    net.load_state_dict({**own, **tensors, **identity})
+    identity = {
+        key: torch.zeros_like(fresh[key]) for key in lacking if key.endswith("second.weight")
+    }
+    net.load_state_dict({**fresh, **tensors, **identity})
     return net
 
 
-def _fits(given: Tensor | None, own: Tensor | None) -> bool:
-    return given is not None and own is not None and given.shape == own.shape
+def _fits(tensor: Tensor | None, parameter: Tensor | None) -> bool:
+    return tensor is not None and parameter is not None and tensor.shape == parameter.shape
 
 
 def sizes_of(settings: PixelFixerSettings) -> PixelSizes:

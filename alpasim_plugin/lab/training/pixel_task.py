@@ -151,8 +151,8 @@ class PixelTask:
     def batch(self, index: int) -> NoisyBatch:
         """Return the frames and noise of update ``index``, of this process's streams."""
         streams = self.streams.batch
-        own = self._own
-        got = self.streams.update(index, range(streams)[own])
+        local_streams = self._own
+        got = self.streams.update(index, range(streams)[local_streams])
         render, truth, sdmap, opacity = (
             x.permute(0, 1, 3, 4, 2).contiguous()
             for x in (got.render, got.target, got.map, got.opacity)
@@ -162,12 +162,12 @@ class PixelTask:
         )
         frames, *shape = render.shape[1:]
         # Drawn for all streams: the noise of one does not depend on the number of processes.
-        eps = torch.randn((streams, frames, *shape), generator=source)[own]
-        eps_flow = torch.randn((streams, *shape), generator=source)[own]
-        t = torch.rand(streams, generator=source)[own]
+        eps = torch.randn((streams, frames, *shape), generator=source)[local_streams]
+        eps_flow = torch.randn((streams, *shape), generator=source)[local_streams]
+        t = torch.rand(streams, generator=source)[local_streams]
         rng = stream("training", self.seed, "pixel.frames", index)
-        seen = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
-        t_history = torch.rand(streams, frames, generator=source)[own]
+        checked_frames = tuple(int(i) for i in rng.permutation(frames)[:SEEN])
+        t_history = torch.rand(streams, frames, generator=source)[local_streams]
         flow_frame, top, left = (
             int(rng.integers(frames)),
             *(int(rng.integers(_corners(side))) for side in render.shape[2:4]),
@@ -182,7 +182,7 @@ class PixelTask:
             eps_flow,
             t,
             flow_frame,
-            seen,
+            checked_frames,
             (top, left),
             t_history,
             got.references,
@@ -196,22 +196,24 @@ class PixelTask:
         start = self.net.start(sample.render[:, 0])
         state = start if self._state is None else restarted(self._state, batch.fresh, start)
         distance = None if self.distance is None else self.distance[1]
-        found = pixel_losses(
+        losses = pixel_losses(
             self.net, sample, state, self.variant.objectives(index, self.steps), distance
         )
-        self._state = found.state
-        made, given = (
-            _psnr_db(x, sample.truth) for x in (found.predictions.detach(), sample.render)
+        self._state = losses.state
+        made, render_psnr = (
+            _psnr_db(x, sample.truth) for x in (losses.predictions.detach(), sample.render)
         )
-        degraded = given < 40  # renders that are the truth, or nearly, say nothing about repair
-        gain = ((made - given) * degraded).sum() / degraded.sum().clamp(min=1)
-        return found.total, {
-            "picture": found.picture.detach(),
-            "perceptual": found.perceptual.detach(),
-            "temporal": found.temporal.detach(),
-            "flow": found.flow.detach(),
-            "grid": found.grid.detach(),
-            "choice": found.choice.detach(),
+        degraded = (
+            render_psnr < 40
+        )  # renders that are the truth, or nearly, say nothing about repair
+        gain = ((made - render_psnr) * degraded).sum() / degraded.sum().clamp(min=1)
+        return losses.total, {
+            "picture": losses.picture.detach(),
+            "perceptual": losses.perceptual.detach(),
+            "temporal": losses.temporal.detach(),
+            "flow": losses.flow.detach(),
+            "grid": losses.grid.detach(),
+            "choice": losses.choice.detach(),
             "psnr_db": made.mean(),
             "gain_db": gain,
         }
@@ -222,8 +224,8 @@ class PixelTask:
 
     def carry(self, tensors: Mapping[str, Tensor]) -> None:
         """Take a checkpoint's state, of all streams."""
-        own = {name: part[self._own] for name, part in tensors.items()}
-        self._state = PixelState(**own) if own else None
+        state = {name: part[self._own] for name, part in tensors.items()}
+        self._state = PixelState(**state) if state else None
 
 
 def _corners(side: int) -> int:

@@ -99,14 +99,14 @@ class RightOfWay:
             longer.append(replace(actor, box=replace(actor.box, length_m=length_m)))
         return RightOfWay(ScriptedTracks(longer, end_us), Lines([path]), vehicle.box, front_m)
 
-    def seen(self, t_us: int, s_m: float) -> Bool:
+    def in_sight(self, t_us: int, s_m: float) -> Bool:
         """Return which of the others ``(K,)`` are within `SIDE_SIGHT_M` of the car."""
-        here, _ = self.line.at(np.zeros(1, dtype=np.int64), np.array([s_m]))
-        apart = self.table.xy[self.table.rows(t_us)[0]] - here[:, :2]
+        car, _ = self.line.at(np.zeros(1, dtype=np.int64), np.array([s_m]))
+        apart = self.table.xy[self.table.rows(t_us)[0]] - car[:, :2]
         return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) < SIDE_SIGHT_M)
 
     def acceleration(
-        self, t_us: int, s_m: float, speed_mps: float, style: DrivingStyle, seen: Bool
+        self, t_us: int, s_m: float, speed_mps: float, style: DrivingStyle, in_sight: Bool
     ) -> float:
         """Return the largest acceleration, m/s^2, behind all whom the driver has seen and who are or
         will be in the way; infinite without such ones.
@@ -119,7 +119,7 @@ class RightOfWay:
             table.xy[rows],
             table.yaw[rows],
             table.velocity[rows],
-            table.present[rows] & seen,
+            table.present[rows] & in_sight,
             tuple(table.boxes),
             np.zeros(len(table.boxes), dtype=np.bool_),
         )
@@ -185,12 +185,12 @@ def expert_speeds(
     gap = leader.gap_m
     driven = [v]
     yields = float("inf")
-    seen = None if others is None else others.seen(t_us, s_m)
+    in_sight = None if others is None else others.in_sight(t_us, s_m)
     for step in range(round(TIMES_S[-1] / STEP_S)):
         before = s
         most = following_acceleration(v, Leader(gap, leader.speed_mps, leader.index), style)
-        if others is not None and seen is not None and step % DECISION_STEPS == 0:
-            yields = others.acceleration(t_us + round(step * STEP_S * 1e6), s, v, style, seen)
+        if others is not None and in_sight is not None and step % DECISION_STEPS == 0:
+            yields = others.acceleration(t_us + round(step * STEP_S * 1e6), s, v, style, in_sight)
         s, v = advance(s, v, acceleration(line, s, v, min(most, yields), style), STEP_S)
         gap += leader.speed_mps * STEP_S - (s - before)
         driven.append(v)

@@ -20,15 +20,15 @@ def join_ranks(place: torch.device) -> tuple[int, int]:
         return 0, 1
     if not distributed.is_initialized():
         backend = implementation(place, "gloo", "nccl")
-        own: torch.device | None = implementation(place, None, place)
-        distributed.init_process_group(backend, device_id=own)
+        card: torch.device | None = implementation(place, None, place)
+        distributed.init_process_group(backend, device_id=card)
     return distributed.get_rank(), distributed.get_world_size()
 
 
-def rows_of_all(own: Tensor, ranks: int) -> Tensor:
+def rows_of_all(rows: Tensor, ranks: int) -> Tensor:
     """Return the rows of all processes, as many each, in the order of their numbers."""
-    parts = [torch.empty_like(own) for _ in range(ranks)]
-    distributed.all_gather(parts, own.contiguous())
+    parts = [torch.empty_like(rows) for _ in range(ranks)]
+    distributed.all_gather(parts, rows.contiguous())
     return torch.cat(parts)
 
 

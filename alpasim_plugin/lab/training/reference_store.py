@@ -69,9 +69,8 @@ class SequenceReferences:
         index = self.index()
         whole = slice(None)
         last: Sequence[int] = ()
-        picture = lru_cache(count + 1)(
-            self.picture
-        )  # most are those of the frame before, as in a drive
+        # Most are those of the frame before, as in a drive
+        picture = lru_cache(count + 1)(self.picture)
         for i in range(frames):
             last = index.choose(self.T_world_camera[i], int(self.t_us[i]), count, last, past)
             target = self.target(i, self.K, whole, whole)
@@ -151,10 +150,11 @@ def open_references(sequence: PairSequence) -> SequenceReferences | None:
         "boxes",
         *(f"{FOLDER}/{name}" for name in ("rgb", "depth", "T_world_camera", "t_us", "actors")),
     )
+    # Plain: faster
     opened = [
         np.asarray(open_npy(folder / f"{name}.npy", "run 'simrun train pairs' again"))
         for name in names
-    ]  # plain: faster
+    ]
     clip = sequence.clip
     if len(opened[0]) < len(clip) or len({len(array) for array in opened[3:]}) != 1:
         raise InputError(

@@ -67,11 +67,13 @@ class RenderStep:
         """Return what the deployed model shows of a clip from its start ``(B, 3, T, H, W)``; the
         first four frames have no references.
         """
-        shown: list[Tensor] = []
+        displayed: list[Tensor] = []
         for t in range(render.shape[2]):
-            references = None if t < REFERENCES else torch.cat(shown[: -REFERENCES - 1 : -1], dim=2)
-            shown.append(eight_bits(self(render[:, :, t : t + 1], references)))
-        return torch.cat(shown, dim=2)
+            references = (
+                None if t < REFERENCES else torch.cat(displayed[: -REFERENCES - 1 : -1], dim=2)
+            )
+            displayed.append(eight_bits(self(render[:, :, t : t + 1], references)))
+        return torch.cat(displayed, dim=2)
 
 
 def eight_bits(frames: Tensor) -> Tensor:

@@ -127,12 +127,12 @@ class RenderStepTask:
         (render, clean), w = batch.pictures, batch.frame
         references: Tensor | None = None
         if batch.joined:
-            shown = (
+            displayed = (
                 clean[:, :, :w]
                 if self.config.references == "clean"
                 else self.step.outputs(render[:, :, :w])
             )
-            references = newest_first(shown)
+            references = newest_first(displayed)
         made = self.step(render[:, :, w : w + 1], references)
         wanted = clean[:, :, w : w + 1]
         parts = picture_losses(made, wanted, self.distance, self.config.weight, self.largest)
@@ -152,11 +152,10 @@ def largest_distance(
     """Return the quantile ``share`` of the distances between renders and clean frames in the first
     training batches, to three digits.
     """
-    found: list[float] = []
-    while len(found) < MEASURED:
-        render, clean = batches[
-            len(found)
-        ]  # any batches will do, as long as they are always the same
-        shown = (upload(images[:, :, -1], device) for images in (render, clean))
-        found += distance(*shown).tolist()
-    return float(f"{np.quantile(found, share):.3g}")
+    distances: list[float] = []
+    while len(distances) < MEASURED:
+        # Any batches will do, as long as they are always the same
+        render, clean = batches[len(distances)]
+        image_pair = (upload(images[:, :, -1], device) for images in (render, clean))
+        distances += distance(*image_pair).tolist()
+    return float(f"{np.quantile(distances, share):.3g}")

@@ -19,6 +19,7 @@ VEHICLES: Mapping[str, float] = {
     "cyclist": 0.09,
 }
 PARKED: Mapping[str, float] = {"car": 0.75, "truck": 0.15, "bus": 0.04, "motorcycle": 0.06}
+# In a row
 SPACING_M: Mapping[str, float] = {
     "car": 7.0,
     "truck": 10.5,
@@ -26,7 +27,7 @@ SPACING_M: Mapping[str, float] = {
     "motorcycle": 5.0,
     "cyclist": 4.0,
     "pedestrian": 3.0,
-}  # in a row
+}
 
 
 def number(rng: Rng, low: float, high: float, digits: int = 2) -> float:

@@ -274,14 +274,14 @@ def _cyclists(rng: Rng, time_s: float) -> Spec:
     actors = [leader(rng, v, 0, "cyclist")]
     for i in range(int(rng.integers(1, 4))):
         offset = -round(width / 2 - 0.5, 2)
-        at = {
+        position = {
             "s_m": round(number(rng, 30, 45) + 25 * i, 1),
             "offset_m": offset,
             "speed_mps": number(rng, 3.5, 6),
         }
         actors.append(
             {"kind": "oncoming", "id": f"comes-{i}", "label": pick(rng, "cyclist", "motorcycle")}
-            | at
+            | position
         )
     return {
         "road": road,

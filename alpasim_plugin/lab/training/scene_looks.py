@@ -56,8 +56,8 @@ def draw_damage(rng: Rng, ranges: DamageRanges, kind: str | None = None) -> Spec
     """Return the section ``degradation`` of a scene, of a kind that is drawn where none is
     given.
     """
-    drawn = "cycle" if rng.random() < CYCLE_SHARE else "reconstruction"
-    out: Spec = {"kind": kind or drawn, "share": log_number(rng, *ranges.share)}
+    random_kind = "cycle" if rng.random() < CYCLE_SHARE else "reconstruction"
+    out: Spec = {"kind": kind or random_kind, "share": log_number(rng, *ranges.share)}
     out |= {
         "views_per_s": log_number(rng, *ranges.views_per_s, digits=2),
         "depth_error": number(rng, *ranges.depth_error, digits=3),
@@ -73,12 +73,14 @@ def draw_camera(rng: Rng) -> Spec:
     """Return a camera of training: mostly small, of several sizes, fields of view and mounts."""
     sizes: Mapping[tuple[int, int], float] = SIZES
     width, height = list(sizes)[int(rng.choice(len(sizes), p=list(sizes.values())))]
-    own = rng.random() < OWN_CAMERA_SHARE
+    varies_mount = rng.random() < OWN_CAMERA_SHARE
     fov = number(rng, 55, 100, 1)
     z_m = number(rng, 1.2, 2.2)
     pitch = number(rng, 0, 8, 1)
     x_m = number(rng, 0.8, 2.0)
-    mount = {"hfov_deg": fov, "z_m": z_m, "pitch_down_deg": pitch, "x_m": x_m} if own else {}
+    mount = (
+        {"hfov_deg": fov, "z_m": z_m, "pitch_down_deg": pitch, "x_m": x_m} if varies_mount else {}
+    )
     return {"width": width, "height": height} | mount
 
 

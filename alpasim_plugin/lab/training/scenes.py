@@ -31,14 +31,22 @@ from alpasim_plugin.lab.training.scene_looks import (
 from scenarios.load import load_scenario
 
 Split = Literal[
-    "train", "val", "test-known", "test-unseen", "beside-known", "beside-unseen",
-    "three/train", "three/val", "three/test",
-]  # fmt: skip
+    "train",
+    "val",
+    "test-known",
+    "test-unseen",
+    "beside-known",
+    "beside-unseen",
+    "three/train",
+    "three/val",
+    "three/test",
+]
 TEST_SPLITS: tuple[Split, ...] = ("test-known", "test-unseen")
+# Tests of fixed distances from the recorded path.
 BESIDE_SPLITS: tuple[Split, ...] = (
     "beside-known",
     "beside-unseen",
-)  # tests of fixed distances from the recorded path
+)
 DRAWS = 8  # samples per scene: one that the expert cannot drive is rejected
 
 
@@ -100,8 +108,8 @@ def draw_spec(split: Split, family: str, scene_id: str, seed: int, duration_s: f
     )
     spec = recipe.families[family](rng, duration_s + 2.0)
     spec["road"].setdefault("heading_deg", round(float(rng.uniform(-180, 180)), 1))
-    drawn = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
-    spec["environment"] = drawn | spec.get("environment", {})
+    surroundings = unseen_surroundings(looks) if recipe.unseen else known_surroundings(looks)
+    spec["environment"] = surroundings | spec.get("environment", {})
     if recipe.own_cameras:
         spec["cameras"] = [draw_camera(looks)]
     if recipe.three_cameras:

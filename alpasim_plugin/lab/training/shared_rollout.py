@@ -226,9 +226,8 @@ class _Rollout:
         self.window = window
         self.z_1 = mixed_source(s.z_r, s.m, s.eps)
         self.predict = self.generate if objectives.predicted == "own" else self.denoise_again
-        self.first = max(
-            s.w - objectives.horizon + 1, 0
-        )  # first position whose prediction keeps its gradient
+        # First position whose prediction keeps its gradient
+        self.first = max(s.w - objectives.horizon + 1, 0)
         self.predicted: Tensor | None = None
         self._before: GraphCache | None = (
             None  # the rollout's cache before the block that holds ``first``

@@ -46,11 +46,13 @@ P_STRIDE_2 = 0.2
 P_FLIP = 0.5
 P_PHOTOMETRIC = 0.7
 P_CLASS_COLOURS = 0.25
-GAIN, CHANNEL_GAIN, GAMMA = (0.6, 1.15), (0.9, 1.1), (0.85, 1.2)  # of a photometric augmentation
-P_BETTER, BETTER = (
-    0.15,
-    (0.2, 0.95),
-)  # a render is moved this far to the truth: the better a fit, the more every change harms
+# Of a photometric augmentation
+GAIN = (0.6, 1.15)
+CHANNEL_GAIN = (0.9, 1.1)
+GAMMA = (0.85, 1.2)
+# A render is moved this far to the truth: the better a fit, the more every change harms
+P_BETTER = 0.15
+BETTER = (0.2, 0.95)
 # an episode of pairs shows a recorded street, where there are any: few drives say more of real fits
 # than their number
 P_DRIVE = 0.3
@@ -65,11 +67,9 @@ P_DOUBLED = 0.5
 P_LOST_RESOLUTION = 0.5
 # Undamaged frames get detail that the corpus has little of, in both places: a camera's sharpening
 # and its noise. Both are to be kept.
-P_DETAIL, SHARPNESS, GRAIN = (
-    0.5,
-    (0.0, 1.5),
-    (0.0, 0.05),
-)  # of the difference from a blur of 1 pixel; standard deviation, levels of [-1, 1]
+P_DETAIL = 0.5
+SHARPNESS = (0.0, 1.5)  # of the difference from a blur of 1 pixel
+GRAIN = (0.0, 0.05)  # standard deviation, levels of [-1, 1]
 
 
 @dataclass(frozen=True)
@@ -249,9 +249,9 @@ class TrainingStreams:
         """Return the batch of update ``i``, counted from 0; of some slots, or of all."""
         chosen = range(self.batch) if slots is None else slots
         episodes = [self.episode_of(slot, i) for slot in chosen]
-        shown = [self._show(episode, at) for episode, at in episodes]
+        samples = [self._show(episode, at) for episode, at in episodes]
         render, opacity, sdmap, target, references, users = (
-            torch.from_numpy(np.stack(arrays)) for arrays in zip(*shown, strict=True)
+            torch.from_numpy(np.stack(arrays)) for arrays in zip(*samples, strict=True)
         )
         fresh = torch.tensor([at == 0 or i == 0 for _, at in episodes])
         return StreamBatch(
@@ -269,8 +269,8 @@ class TrainingStreams:
         """Return what a slot shows at update ``i``, and how many updates of the episode came
         before.
         """
-        number, at = divmod(i + slot * self.episode // self.batch, self.episode)
-        return self._draw(slot, number), at
+        number, updates_before = divmod(i + slot * self.episode // self.batch, self.episode)
+        return self._draw(slot, number), updates_before
 
     def facts(self) -> dict[str, Any]:
         """Return what the batches depend on, for a run's card and the refusal of other data."""
@@ -306,12 +306,12 @@ class TrainingStreams:
         gamma = rng.uniform(*GAMMA)
         other = OTHERS[int(rng.integers(len(OTHERS)))]
         grey = np.arange(256)[:, None] / 255
-        shown = (
+        colours = (
             np.clip(gain * channels * grey**gamma, 0, 1)
             if photometric
             else np.repeat(grey, 3, axis=1)
         )
-        levels: F32 = (shown * 2 - 1).astype(np.float32)
+        levels: F32 = (colours * 2 - 1).astype(np.float32)
         step = (-1 if reverse else 1) * (2 if stride_2 else 1)
         detailed = rng.random() < P_DETAIL
         sharpness, grain = (
@@ -351,14 +351,15 @@ class TrainingStreams:
             elsewhere,
         )
 
-    def _show(self, episode: Episode, at: int) -> tuple[F32, F32, F32, F32, F32, Bool]:
+    def _show(self, episode: Episode, update: int) -> tuple[F32, F32, F32, F32, F32, Bool]:
         """Return render ``(T, 3, h, w)``, opacity ``(T, 1, h, w)``, map, target, references and
         road users of an episode's update.
         """
         clip = episode.sequence.clip
         kind = KINDS[episode.kind]
         index = there_and_back(
-            episode.start + episode.step * (at * self.frames + np.arange(self.frames)), len(clip)
+            episode.start + episode.step * (update * self.frames + np.arange(self.frames)),
+            len(clip),
         )
         columns = slice(episode.left, episode.left + self.crop[1])
         rows = slice(episode.top, episode.top + self.crop[0])
@@ -374,7 +375,7 @@ class TrainingStreams:
                 target,
                 episode.sharpness,
                 episode.grain,
-                stream("training", self.seed, f"{episode.key}.grain", at),
+                stream("training", self.seed, f"{episode.key}.grain", update),
             )
         render = (
             _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
@@ -390,11 +391,11 @@ class TrainingStreams:
             opacity = np.ones_like(opacity)
         elif episode.sequence not in self.drives:  # a real fit is never exact where it looks so
             render = render + np.float32(episode.better) * (target - render)
-        drawn = episode.references, index, rows, columns
+        reference_crop = episode.references, index, rows, columns
         recorded = (
-            pair_references(episode.sequence, *drawn)
+            pair_references(episode.sequence, *reference_crop)
             if kind in ("pairs", "identity")
-            else video_references(clip, *drawn)
+            else video_references(clip, *reference_crop)
         )
         references = _lit_references(recorded, episode)
         if episode.grey:
@@ -418,9 +419,9 @@ class TrainingStreams:
         )
 
     def _map(self, sdmap: U8, episode: Episode) -> F32:
-        shown = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap
+        map_frames = swap_class_colours(sdmap, episode.car_class) if episode.car_class else sdmap
         return np.ascontiguousarray(
-            shown.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1
+            map_frames.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1
         )
 
 
@@ -467,14 +468,14 @@ def _moved(frames: F32, episode: Episode, rng: np.random.Generator) -> F32:
         [
             cv2.remap(
                 frame.transpose(1, 2, 0),
-                at,
+                shift,
                 None,
                 cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REFLECT_101,
             )
             for frame in frames
         ]
-        for at in fields
+        for shift in fields
     ]
     return np.clip(np.mean(moved, axis=0, dtype=np.float32), -1, 1).transpose(0, 3, 1, 2)
 

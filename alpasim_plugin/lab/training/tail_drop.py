@@ -42,8 +42,8 @@ class TailDrop:
         m = s.m.clone()
         condition = s.condition.clone()
         for b in range(len(m)):
-            shown = self.shown_frames(1 + GROUP * (n - 1), rng)
-            latents = 0 if not shown else 1 + -(-(shown - 1) // GROUP)
+            frame_count = self.shown_frames(1 + GROUP * (n - 1), rng)
+            latents = 0 if not frame_count else 1 + -(-(frame_count - 1) // GROUP)
             m[b, :, latents:] = 0
             condition[b, -OPACITY_CHANNELS:, latents:] = 0
         return replace(s, m=m, condition=condition)

@@ -182,8 +182,8 @@ class Trainer(Generic[Batch]):
         if nobodys := sorted(
             set(self.parameters) - {key for _, _, own in self._parts for key in own}
         ):
-            found = listed("trained without a schedule", nobodys)
-            raise InputError(f"{folder}: {found}", "freeze them, or name their part")
+            problem = listed("trained without a schedule", nobodys)
+            raise InputError(f"{folder}: {problem}", "freeze them, or name their part")
         groups = [group for _, part, own in self._parts for group in _groups(part, own, schedule)]
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
@@ -256,11 +256,11 @@ class Trainer(Generic[Batch]):
             if name not in missing and tensors[f"weight.{name}"].shape != p.shape
         )
         if missing or wrong:
-            found = "; ".join(
+            problem = "; ".join(
                 filter(None, (listed("no weights of", missing), listed("another shape of", wrong)))
             )
             raise InputError(
-                f"{checkpoint}: {found}",
+                f"{checkpoint}: {problem}",
                 f"give the {STATE_FILE} of a run with the same network",
             )
         self._take(tensors)
@@ -282,10 +282,11 @@ class Trainer(Generic[Batch]):
     def _write(self, carried: Mapping[str, Tensor]) -> None:
         tensors: dict[str, Tensor] = {f"average.{n}": t for n, t in self.average.items()}
         tensors |= {f"weight.{n}": p.detach() for n, p in self.parameters.items()}
+        # A part that has had no gradient yet has no moments
         for (
             name,
             p,
-        ) in self.parameters.items():  # a part that has had no gradient yet has no moments
+        ) in self.parameters.items():
             tensors |= {
                 f"moment.{key}.{name}": value
                 for key, value in self.optimiser.state.get(p, {}).items()
@@ -305,10 +306,10 @@ class Trainer(Generic[Batch]):
         sums: dict[str, Tensor | float] = {}
         n = self.schedule.accumulate
         first = self.step * n + self.rank % self._stride
-        own = range(first, (self.step + 1) * n, self._stride)
-        parts = len(own) * self.ranks  # whose mean is the update's
+        indices = range(first, (self.step + 1) * n, self._stride)
+        parts = len(indices) * self.ranks  # whose mean is the update's
         held = []  # until the host has waited for the device
-        for index in own:
+        for index in indices:
             held.append(self._ahead.pop(index) if index in self._ahead else self._sent(index))
             with autocast(self.device, self._autocast):
                 loss, numbers = self._loss(held[-1], index)
@@ -325,20 +326,19 @@ class Trainer(Generic[Batch]):
                 distributed.all_reduce(part)
         norms = self._clip()
         values = torch.stack([*totals, *norms.values()]).cpu()  # the host waits here alone
-        found = dict(zip([*sums, *norms], values.tolist(), strict=True))
-        if not all(map(math.isfinite, found.values())):
-            self._stop(index, f"update {self.step}: {found}")
+        logged = dict(zip([*sums, *norms], values.tolist(), strict=True))
+        if not all(map(math.isfinite, logged.values())):
+            self._stop(index, f"update {self.step}: {logged}")
         lr = self.schedule.lr(self.step)
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group["rate"]
         self.optimiser.step()
         self.step += 1
-        self._kept = (
-            {} if self._carried is None else dict(self._carried.carried())
-        )  # only now: a failed update leaves the last one's
+        # Only now: a failed update leaves the last one's
+        self._kept = {} if self._carried is None else dict(self._carried.carried())
         self._update_average()
         return {
-            **found,
+            **logged,
             "lr": lr,
             "s": time.perf_counter() - began,
             CORE_S: time.process_time() - core_began,
@@ -353,11 +353,11 @@ class Trainer(Generic[Batch]):
     def _clip(self) -> dict[str, Tensor]:
         """Clip the gradients of every part that has any, and return their norms."""
         norms = {}
-        for name, part, own in self._parts:
-            if any(p.grad is not None for p in own.values()):
+        for name, part, parameters in self._parts:
+            if any(p.grad is not None for p in parameters.values()):
                 clip = self.schedule.clip if part.clip is None else part.clip
                 key = f"grad_norm.{name}" if len(self._parts) > 1 else "grad_norm"
-                norms[key] = nn.utils.clip_grad_norm_(list(own.values()), clip)
+                norms[key] = nn.utils.clip_grad_norm_(list(parameters.values()), clip)
         return norms
 
     def _update_average(self) -> None:
@@ -370,13 +370,13 @@ class Trainer(Generic[Batch]):
                 if p.grad is not None:
                     self.average[name].lerp_(p, 1 - decay)
 
-    def _stop(self, index: int, found: str) -> None:
+    def _stop(self, index: int, problem: str) -> None:
         path = self.folder / BAD_FILE
         with atomic_file(path) as partial:
             torch.save(self._batch(index), partial)
         self.save()
         raise InfrastructureError(
-            f"{self.folder}: {found}",
+            f"{self.folder}: {problem}",
             f"inspect the batch in {path}; lower the learning rate or repair the data, then run again: training resumes",
         )
 
@@ -480,7 +480,7 @@ def _parameters_of(part: str, parameters: Mapping[str, nn.Parameter]) -> dict[st
 
 
 def _groups(
-    part: PartSchedule, own: Mapping[str, nn.Parameter], schedule: Schedule
+    part: PartSchedule, parameters: Mapping[str, nn.Parameter], schedule: Schedule
 ) -> list[dict[str, Any]]:
     """Return the optimiser's groups of a part: matrices and kernels decay, gains and biases do
     not.
@@ -488,9 +488,9 @@ def _groups(
     shared = {"rate": part.rate, "betas": part.betas}
     return [
         {
-            "params": [p for p in own.values() if p.ndim > 1],
+            "params": [p for p in parameters.values() if p.ndim > 1],
             "weight_decay": schedule.weight_decay,
             **shared,
         },
-        {"params": [p for p in own.values() if p.ndim <= 1], "weight_decay": 0.0, **shared},
+        {"params": [p for p in parameters.values() if p.ndim <= 1], "weight_decay": 0.0, **shared},
     ]

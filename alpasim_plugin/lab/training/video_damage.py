@@ -26,7 +26,9 @@ from alpasim_plugin.gaussians.sh import dc_from_rgb
 
 Rng = np.random.Generator
 MARGIN_PX = 12.0  # splats live this far outside the image
-NEAR_M, FAR_M = 5.0, 20.0  # invented depths: lower rows are nearer and drawn over higher ones
+# Invented depths: lower rows are nearer and drawn over higher ones
+NEAR_M = 5.0
+FAR_M = 20.0
 # share by which a colour approaches the frame's, each frame: views taken later are part of the fit
 # as well
 REFIT = 0.08
@@ -118,9 +120,8 @@ def damage_video(
     flow_between = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     thin = _thin_ground(rng, (h, w), damage)
     patches = smooth_field(rng, (h, w), 4, 30 * w / 256).astype(np.float64)
-    blotches = damage.colour_error * (
-        0.8 * patches[..., :1] + 0.35 * patches[..., 1:]
-    )  # more of brightness than of hue
+    # More of brightness than of hue
+    blotches = damage.colour_error * (0.8 * patches[..., :1] + 0.35 * patches[..., 1:])
     behind = np.asarray(
         frames[0][: max(1, h // 4)].reshape(-1, 3).mean(axis=0) / 255
         if rng.random() < 0.7
@@ -180,9 +181,11 @@ def _born(
     rows = int(np.ceil(h / cell)) + 2
     columns = int(np.ceil(w / cell)) + 2
     free = np.ones((rows, columns), dtype=bool)
-    at = np.floor(taken / cell + 1).astype(int)
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < columns) & (at[:, 1] < rows)
-    free[at[inside, 1], at[inside, 0]] = False
+    cell_index = np.floor(taken / cell + 1).astype(int)
+    inside = (
+        (cell_index >= 0).all(axis=1) & (cell_index[:, 0] < columns) & (cell_index[:, 1] < rows)
+    )
+    free[cell_index[inside, 1], cell_index[inside, 0]] = False
     # A gap closes with a delay: a fit sees it only with the next view.
     chosen = np.argwhere(free & (rng.random(free.shape) < (0.35 if len(taken) else 1.0)))
     xy = (chosen[:, ::-1] - 1 + rng.random((len(chosen), 2))) * cell

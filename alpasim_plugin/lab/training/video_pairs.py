@@ -95,10 +95,10 @@ def make_video_pairs(path: Path, folder: Path, recipe: VideoRecipe) -> Iterator[
             target = folder / split / name
             made = not is_made(target, info)
             if made:
-                shown = damage_video(frames, damage, rng)
+                damaged = damage_video(frames, damage, rng)
                 write_sequence(
                     target,
-                    _pairs(shown, frames, video.t_us[part.start : part.stop]),
+                    _pairs(damaged, frames, video.t_us[part.start : part.stop]),
                     len(frames),
                     info,
                 )

@@ -109,11 +109,10 @@ def grid_ratio(images: U8, truths: U8, side: int = 4, flat_levels: float = 3.0) 
         step, flat = (
             np.abs(np.diff(x.astype(np.int16), axis=axis)).mean(axis=-1) for x in (images, truths)
         )
-        at = (
-            np.arange(1, step.shape[axis + 1] + 1) % side == 0
-        )  # the step from pixel k to k + 1 crosses a border where side divides k + 1
-        at = at[:, None] if axis == -3 else at
-        for total, chosen in ((border, at), (elsewhere, ~at)):
+        # The step from pixel k to k + 1 crosses a border where side divides k + 1
+        on_border = np.arange(1, step.shape[axis + 1] + 1) % side == 0
+        on_border = on_border[:, None] if axis == -3 else on_border
+        for total, chosen in ((border, on_border), (elsewhere, ~on_border)):
             counted = step[(flat <= flat_levels) & chosen]
             total += (counted.sum(), counted.size)
     if not border[1] or not elsewhere[0]:

@@ -229,9 +229,9 @@ def _state(plan: Trunk, trunk: StateDict, heads: StateDict, source: str) -> Stat
 def _tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -> Tensor:
     value = tensors.get(key)
     if value is None or tuple(value.shape) != shape:
-        found = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
+        problem = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"
         raise InputError(
-            f"{key} in {source}: {found}", f"give the published weights, where it is {shape}"
+            f"{key} in {source}: {problem}", f"give the published weights, where it is {shape}"
         )
     return weight(key, value, source)
 

@@ -31,11 +31,11 @@ def sheet(columns: Mapping[str, Sequence[U8]], rows: Sequence[str]) -> U8:
             "give each column one image of one size per row",
         )
     parts = []
-    for at, (title, column) in enumerate(columns.items()):
+    for column_index, (title, column) in enumerate(columns.items()):
         head = np.full((TITLE_PX, column[0].shape[1], 3), 255, dtype=np.uint8)
         _write(head, title, (3, TITLE_PX - 5), (0, 0, 0))
         cells = [np.array(picture) for picture in column]
-        if at == 0:
+        if column_index == 0:
             for cell, text in zip(cells, rows, strict=True):
                 _write(cell, text, (3, 13), (255, 255, 255))
         parts.append(np.concatenate([head, *(_below(cell) for cell in cells)]))
@@ -47,7 +47,9 @@ def _below(cell: U8) -> U8:
     return np.concatenate([cell, np.full((GAP_PX, cell.shape[1], 3), 255, dtype=np.uint8)])
 
 
-def _write(image: U8, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+def _write(image: U8, text: str, position: tuple[int, int], colour: tuple[int, int, int]) -> None:
     if colour == (255, 255, 255):
-        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 3, cv2.LINE_AA)
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+        cv2.putText(
+            image, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 3, cv2.LINE_AA
+        )
+    cv2.putText(image, text, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)

@@ -48,19 +48,19 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     paired: dict[str, Any] = {}
     facts: dict[str, dict[str, Any]] = {"clips": {}, "frames": {}, "identical": {}, "events": {}}
     for name, by_clip in variants.items():
-        mine = list(by_clip.values())
+        clip_rows = list(by_clip.values())
         arms[name] = {
-            metric: _mean([value_of(row, metric) for row in mine], metric)
-            for metric in metrics_of(mine)
+            metric: _mean([value_of(row, metric) for row in clip_rows], metric)
+            for metric in metrics_of(clip_rows)
         }
         if name not in (baseline, TRUTH):
             paired[name] = _paired(by_clip, variants[baseline])
         events: Counter[str] = Counter()
-        for row in mine:
+        for row in clip_rows:
             events.update(row["events"])
-        facts["clips"][name] = len(mine)
-        facts["frames"][name] = sorted({int(row["frames"]) for row in mine})
-        facts["identical"][name] = sum(int(row["identical"]) for row in mine)
+        facts["clips"][name] = len(clip_rows)
+        facts["frames"][name] = sorted({int(row["frames"]) for row in clip_rows})
+        facts["identical"][name] = sum(int(row["identical"]) for row in clip_rows)
         facts["events"][name] = dict(events)
     return {"baseline": baseline, "arms": arms, "paired": paired, **facts}
 
@@ -87,8 +87,8 @@ def _mean(values: Sequence[float], metric: str) -> dict[str, Any]:
     return entry | ({"reason": interval.reason} if interval.reason else {})
 
 
-def _paired(mine: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, Any]:
-    pairs = [(mine[clip], baseline[clip]) for clip in mine if clip in baseline]
+def _paired(rows: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, Any]:
+    pairs = [(rows[clip], baseline[clip]) for clip in rows if clip in baseline]
     out: dict[str, Any] = {}
     for metric in metrics_of([row for pair in pairs for row in pair]):
         differences = [value_of(a, metric) - value_of(b, metric) for a, b in pairs]

@@ -19,18 +19,18 @@ def markdown(summary: Mapping[str, Any]) -> str:
     """
     arms = summary["arms"]
     paired = summary["paired"]
-    shown = [metric for metric in FACTS if any(metric in values for values in arms.values())]
-    titles = [f"{FACTS[metric].title} {ARROWS[FACTS[metric].direction]}" for metric in shown]
+    metrics = [metric for metric in FACTS if any(metric in values for values in arms.values())]
+    titles = [f"{FACTS[metric].title} {ARROWS[FACTS[metric].direction]}" for metric in metrics]
     rows = []
     for name, values in arms.items():
         lengths = summary["frames"][name]
         frames = str(lengths[0]) if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]}"
-        cells = [_cell(metric, values.get(metric)) for metric in shown]
+        cells = [_cell(metric, values.get(metric)) for metric in metrics]
         rows.append([name, *cells, f"{summary['clips'][name]} x {frames}"])
     tables = [_table(["variant", *titles, "clips x frames"], rows)]
     if paired:
         rows = [
-            [name, *(_cell(metric, values.get(metric)) for metric in shown)]
+            [name, *(_cell(metric, values.get(metric)) for metric in metrics)]
             for name, values in paired.items()
         ]
         tables.append(_table([f"minus {summary['baseline']}", *titles], rows))

@@ -13,7 +13,9 @@ from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.types import F32, F64, U8
 from alpasim_plugin.lab.video_metrics.frames import check_stack
 
-LATE_SHARE, LATE_LEAST = 3, 30  # the late window is the last third of the pairs, at least 30
+# The late window is the last third of the pairs, at least 30
+LATE_SHARE = 3
+LATE_LEAST = 30
 
 
 def warp_l1(video: U8) -> F64:

@@ -222,9 +222,9 @@ def public_name(name: str) -> str:
         >>> public_name(".simrun.wire.sensorsim.CameraSpec"), public_name(".simrun.wire.runtime.RolloutSpec")
         ('.nre.grpc.protos.sensorsim.CameraSpec', '.RolloutSpec')
     """
-    package, _, rest = name.removeprefix(OURS).partition(".")
+    package, _, message = name.removeprefix(OURS).partition(".")
     public = PACKAGES[package]
-    return f".{public}.{rest}" if public else f".{rest}"
+    return f".{public}.{message}" if public else f".{message}"
 
 
 def _rename_fields(message: DescriptorProto) -> None:
@@ -286,12 +286,12 @@ class Reflection:
             )
             return response
         # The file and all that it imports, which comes later, as clients expect.
-        found: dict[str, bytes] = {}
+        files: dict[str, bytes] = {}
         todo = [file]
         while todo:
-            one = todo.pop(0)
-            if one.name not in found:
-                found[one.name] = one.serialized_pb
-                todo.extend(one.dependencies)
-        response.file_descriptor_response.file_descriptor_proto.extend(found.values())
+            descriptor = todo.pop(0)
+            if descriptor.name not in files:
+                files[descriptor.name] = descriptor.serialized_pb
+                todo.extend(descriptor.dependencies)
+        response.file_descriptor_response.file_descriptor_proto.extend(files.values())
         return response

@@ -47,7 +47,7 @@ def test_masked_pixels_start_no_track(views):
     mask[64:] = False
     found = follow([replace(view, mask=mask) for view in views[:3]])
     assert found.count > 20
-    assert found.at[found.view == 0][:, 1].max() < 65
+    assert found.pixel[found.view == 0][:, 1].max() < 65
 
 
 def test_poses_that_are_off_come_back_to_the_truth(views):

@@ -54,7 +54,7 @@ def road(camera):
 def test_the_road_is_seen_between_four_and_thirty_metres_and_four_beside_the_path(
     road,
 ):
-    rows, columns = np.nonzero(road.seen)
+    rows, columns = np.nonzero(road.mask)
     assert rows.min() == pytest.approx(60 + 180 * EYE_M / 30, abs=1.5)
     assert rows.max() == pytest.approx(60 + 180 * EYE_M / 4, abs=1.5)
     row = 60 + 27  # 10 m ahead
@@ -67,7 +67,7 @@ def test_the_road_is_seen_between_four_and_thirty_metres_and_four_beside_the_pat
 def test_a_line_is_paint_and_found_where_it_is(camera, road, colour):
     picture = drawn(camera, [(1.8, 0.12, colour)])
     paint = paint_of(picture, road)
-    truth = (np.abs(picture.astype(int) - ROAD_LEVEL).max(axis=2) > 60) & road.seen
+    truth = (np.abs(picture.astype(int) - ROAD_LEVEL).max(axis=2) > 60) & road.mask
     assert paint[truth].mean() > 0.8
     assert paint[~cv2.dilate(truth.astype(np.uint8), np.ones((3, 3))).astype(bool)].sum() == 0
 

@@ -123,7 +123,7 @@ def test_finished_clips_are_kept_until_something_differs(data, tmp_path):
         replace(work, seed=1),
         replace(work, frames=9),
         replace(work, variant=other),
-        replace(work, given="truth"),
+        replace(work, input_kind="truth"),
     ):
         assert finish(changed)["frames"] == changed.frames
         assert json.loads(work.row_file.read_text())["key"] != key

@@ -17,7 +17,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.network.checkpoints import load_weights
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
-from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Seen
+from alpasim_plugin.lab.training.clip_batches import BatchForm, ClipBatches, Conditioning
 from alpasim_plugin.lab.training.fixer_run import train_fixer
 from alpasim_plugin.lab.training.recipes.ablation import ABLATION
 from alpasim_plugin.lab.training.shared_rollout import Objectives
@@ -104,7 +104,7 @@ def test_a_black_map_is_encoded_in_training_and_on_the_road(data, tmp_path):
     assert (settings.uses_map, settings.no_map) == (False, "black")
     clips = clips_of(data, tmp_path)
     vae = TinyVAE.from_state_dict(load_weights(data / "vae.safetensors"))
-    shown = ClipBatches(clips, vae, BatchForm(clips=2, columns=4), Seen(map="black"))[
+    shown = ClipBatches(clips, vae, BatchForm(clips=2, columns=4), Conditioning(map="black"))[
         0
     ].sample.condition
     with torch.inference_mode():

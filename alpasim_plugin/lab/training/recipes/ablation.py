@@ -7,7 +7,7 @@ initialisation: diffusion forcing on the same clips, with histories of every noi
 
 from __future__ import annotations
 
-from alpasim_plugin.lab.training.clip_batches import Seen
+from alpasim_plugin.lab.training.clip_batches import Conditioning
 from alpasim_plugin.lab.training.flow_matching import FlowMatching
 from alpasim_plugin.lab.training.generator import SharedRollout
 from alpasim_plugin.lab.training.recipes.recipe import (
@@ -30,9 +30,11 @@ def _row(
     about: str,
     *objectives: Objectives,
     shares: tuple[float, ...] = (1.0,),
-    seen: Seen = Seen(),
+    conditioning: Conditioning = Conditioning(),
 ) -> Recipe:
-    return Recipe(name, about, (Stage(name, SharedRollout(objectives, shares), seen=seen),))
+    return Recipe(
+        name, about, (Stage(name, SharedRollout(objectives, shares), conditioning=conditioning),)
+    )
 
 
 ABLATION = (
@@ -58,9 +60,12 @@ ABLATION = (
     _row("V3", "perceptual loss only", Objectives(None, 4)),
     _row("V3b", "flow matching on clean history and the perceptual loss", Objectives("clean", 4)),
     _row("V4", "k = 1", Objectives("own", 1)),
-    _row("V5", "black map", Objectives("own", 4), seen=Seen(map="black")),
+    _row("V5", "black map", Objectives("own", 4), conditioning=Conditioning(map="black")),
     _row(
-        "V6", "from noise, render as a condition", Objectives("own", 4), seen=Seen(source="noise")
+        "V6",
+        "from noise, render as a condition",
+        Objectives("own", 4),
+        conditioning=Conditioning(source="noise"),
     ),
     _row(
         "V7",

@@ -12,7 +12,7 @@ from typing import Literal
 
 from alpasim_plugin.fixers.network.schedule import SHIFT
 from alpasim_plugin.lab.training.adversarial import AdversarialTerm
-from alpasim_plugin.lab.training.clip_batches import Seen
+from alpasim_plugin.lab.training.clip_batches import Conditioning
 from alpasim_plugin.lab.training.distillation import Distillation
 from alpasim_plugin.lab.training.flow_matching import FlowMatching
 from alpasim_plugin.lab.training.recipes.recipe import INIT_BI, Attention, Recipe, Stage, whole_clip
@@ -62,12 +62,12 @@ def artifixers(times: Literal["block", "clip"]) -> FlowMatching:
     return FlowMatching(times, shift=SHIFT, bell=True, tail_drop=TailDrop())
 
 
-OPACITY = Seen(map="nothing", opacity=True)
+OPACITY = Conditioning(map="nothing", opacity=True)
 BIDIRECTIONAL = Stage(
     "bidirectional",
     artifixers("clip"),
     attention=whole_clip,
-    seen=OPACITY,
+    conditioning=OPACITY,
     start={"dit": f"{INIT_BI}.dit"},
 )
 FORCED = Stage(

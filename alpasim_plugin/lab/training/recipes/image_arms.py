@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from alpasim_plugin.lab.training.clip_batches import Seen
+from alpasim_plugin.lab.training.clip_batches import Conditioning
 from alpasim_plugin.lab.training.noise_window_task import NoiseWindowLoss
 from alpasim_plugin.lab.training.recipes.recipe import (
     INIT_BI,
@@ -21,21 +21,20 @@ from alpasim_plugin.lab.training.recipes.recipe import (
 from alpasim_plugin.lab.training.render_step_task import RenderStepLoss
 from alpasim_plugin.lab.training.trainer import PartSchedule
 
-NO_MAP = Seen(map="nothing")
+NO_MAP = Conditioning(map="nothing")
 TWO_THIRDS = PartSchedule(rate=2 / 3)
 HARMONIZER = Stage(
     "harmonizer",
     RenderStepLoss(weight=0.3, clamp=0.9),
     share=10,
     attention=frame_by_frame,
-    seen=NO_MAP,
+    conditioning=NO_MAP,
     latents=1,
     trained={"dit": TWO_THIRDS, "vae": TWO_THIRDS},
     deployed={"references": 0},
 )
-GSFIX3D_LAST_SHARE = 0.01 ** (
-    10_000 / 25_000
-)  # its rate falls to a hundredth in 25,000 updates; the paper's run has 10,000
+# Its rate falls to a hundredth in 25,000 updates; the paper's run has 10,000
+GSFIX3D_LAST_SHARE = 0.01 ** (10_000 / 25_000)
 CONDITION_DROPOUT = (
     0.2  # .1 for the image alone and .1 for image and embedding; there is no embedding here
 )
@@ -48,7 +47,7 @@ def _temporal(name: str, about: str, references: Literal["own", "clean"]) -> Rec
         RenderStepLoss(weight=0.3, clamp=0.9, references=references),
         share=3.75,
         attention=whole_clip,
-        seen=NO_MAP,
+        conditioning=NO_MAP,
         latents=2,
         start={"dit": "harmonizer.dit", "vae": "harmonizer.vae"},
         trained=HARMONIZER.trained,
@@ -66,7 +65,7 @@ IMAGE_ARMS = (
                 RenderStepLoss(),
                 share=2,
                 attention=frame_by_frame,
-                seen=NO_MAP,
+                conditioning=NO_MAP,
                 latents=1,
                 decay="constant",
                 trained={"dit": TWO_THIRDS, "vae.decoder": TWO_THIRDS},
@@ -99,7 +98,7 @@ IMAGE_ARMS = (
                 NoiseWindowLoss("uniform", "squared", multi_resolution=True, cut_outs=True),
                 share=25,
                 attention=frame_by_frame,
-                seen=NO_MAP,
+                conditioning=NO_MAP,
                 latents=1,
                 decay="exponential",
                 last_share=GSFIX3D_LAST_SHARE,
@@ -116,7 +115,7 @@ IMAGE_ARMS = (
                 NoiseWindowLoss("log-normal", "edm", dropout=CONDITION_DROPOUT),
                 share=1.25,
                 attention=whole_clip,
-                seen=NO_MAP,
+                conditioning=NO_MAP,
                 latents=WINDOW,
                 start={"dit": f"{INIT_BI}.dit"},
                 trained={"dit": PartSchedule(rate=1 / 3)},

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from alpasim_plugin.block_fixers.settings import DiTSettings, LatentFixerSettings
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.lab.training.clip_batches import BatchForm, Seen
+from alpasim_plugin.lab.training.clip_batches import BatchForm, Conditioning
 from alpasim_plugin.lab.training.latent_clips import LatentClips
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.trainer import Loss, PartSchedule
@@ -99,7 +99,7 @@ class StageInputs:
         dit: Sizes of the transformer where no weights say them.
         rope_ratios: NTK stretch of its rotary positions: height, width, time.
         attention: Of the stage.
-        seen: What the network sees.
+        conditioning: What the network sees.
         weights: Initial weights by part, as `Stage.start` names them.
         vae: Autoencoder of the clips, or the one that ``vae`` starts from; each task may train it
             or leave it frozen.
@@ -116,7 +116,7 @@ class StageInputs:
     dit: DiTSettings
     rope_ratios: tuple[float, float, float]
     attention: Attention
-    seen: Seen
+    conditioning: Conditioning
     weights: Mapping[str, Weights]
     vae: TinyVAE
     clips: LatentClips
@@ -155,7 +155,7 @@ class Stage:
         objective: Loss.
         share: Updates, in units of the run's ``--steps`` (U).
         attention: From the clip's latents to what a latent attends to.
-        seen: What the network sees.
+        conditioning: What the network sees.
         start: Initial weights by part: ``SOURCE.PART``, where the source is ``init``, ``init-bi``
             or an earlier stage. A part that is not named is the objective's to initialise; ``vae``
             is then the run's ``--vae``.
@@ -164,7 +164,7 @@ class Stage:
         decay: How the learning rate falls after the warm-up.
         last_share: Share of the peak that it falls to.
         latents: Latents from a clip's start; None for the whole clip.
-        deployed: Settings of its weights besides those that attention and ``seen`` say.
+        deployed: Settings of its weights besides those that attention and ``conditioning`` say.
         always_float32: Whether its forward passes are in float32 whatever the run's precision is.
     """
 
@@ -172,7 +172,7 @@ class Stage:
     objective: Objective
     share: float = 1.0
     attention: Callable[[int], Attention] = causal
-    seen: Seen = Seen()
+    conditioning: Conditioning = Conditioning()
     start: Mapping[str, str] = field(default_factory=lambda: dict(DIT))
     trained: Mapping[str, PartSchedule] = field(default_factory=lambda: dict(TRAINED_DIT))
     decay: Literal["cosine", "exponential", "constant"] = "cosine"
@@ -208,14 +208,14 @@ class Recipe:
     fixer: str = "onefixer-dit-tiny"
 
     def __post_init__(self) -> None:
-        known = list(GIVEN)
+        sources = list(GIVEN)
         for stage in self.stages:
-            if unknown := [source for source in stage.sources if source not in known]:
+            if unknown := [source for source in stage.sources if source not in sources]:
                 raise InputError(
                     f"{self.name}: stage {stage.name!r} starts from {', '.join(unknown)}",
-                    f"name one of {', '.join(known)}",
+                    f"name one of {', '.join(sources)}",
                 )
-            known.append(stage.name)
+            sources.append(stage.name)
 
     def settings(self, stage: Stage, latents: int) -> dict[str, Any]:
         """Return the settings to deploy a stage's weights with in a block generator, for clips of
@@ -224,6 +224,6 @@ class Recipe:
         return {
             "steps": (1000.0,),
             **asdict(stage.attention(latents)),
-            **stage.seen.settings(),
+            **stage.conditioning.settings(),
             **stage.deployed,
         }

@@ -26,15 +26,15 @@ def by_name(recipes: Iterable[Recipe]) -> Mapping[str, Recipe]:
     Raises:
         InputError: Two of one name.
     """
-    found: dict[str, Recipe] = {}
+    recipe_of_name: dict[str, Recipe] = {}
     for recipe in recipes:
-        if recipe.name in found:
+        if recipe.name in recipe_of_name:
             raise InputError(
                 f"{recipe.name}: a recipe of that name already",
                 "choose another name",
             )
-        found[recipe.name] = recipe
-    return MappingProxyType(found)
+        recipe_of_name[recipe.name] = recipe
+    return MappingProxyType(recipe_of_name)
 
 
 RECIPES = by_name((*ABLATION, *CAUSAL_ARMS, *IMAGE_ARMS))
@@ -104,20 +104,20 @@ def _with_field(recipe: Recipe, text: str) -> Recipe:
     stage_name, dot, key = path.rpartition(".")
     fields = {stage.name: get_type_hints(type(stage.objective)) for stage in recipe.stages}
     chosen = [
-        name for name, known in fields.items() if key in known and (not dot or name == stage_name)
+        name for name, names in fields.items() if key in names and (not dot or name == stage_name)
     ]
-    given = f"--objective {text}"
+    option = f"--objective {text}"
     if not equals or not chosen:
-        known = sorted({f"{name}.{field}" for name, types in fields.items() for field in types})
+        names = sorted({f"{name}.{field}" for name, types in fields.items() for field in types})
         raise InputError(
-            f"{given}: no such field in recipe {recipe.name}",
-            f"write KEY=VALUE with one of {', '.join(known)}",
+            f"{option}: no such field in recipe {recipe.name}",
+            f"write KEY=VALUE with one of {', '.join(names)}",
         )
     try:
         read = TypeAdapter(fields[chosen[0]][key]).validate_python(yaml.safe_load(value))
     except (ValueError, yaml.YAMLError) as error:
         raise InputError(
-            f"{given}: not a value of {key}: {str(error).splitlines()[-1].strip()}",
+            f"{option}: not a value of {key}: {str(error).splitlines()[-1].strip()}",
             "write it as YAML",
         ) from error
     stages = (
@@ -136,13 +136,13 @@ def with_attention(
     if block is None and window is None and sink is None:
         return recipe
 
-    def chosen(of: Callable[[int], Attention], latents: int) -> Attention:
-        own = of(latents)
+    def chosen(attention_of: Callable[[int], Attention], latents: int) -> Attention:
+        attention = attention_of(latents)
         return Attention(
-            own.block_latents if block is None else block,
-            own.window if window is None else window,
-            own.sink if sink is None else sink,
-            own.history,
+            attention.block_latents if block is None else block,
+            attention.window if window is None else window,
+            attention.sink if sink is None else sink,
+            attention.history,
         )
 
     stages = (

@@ -29,9 +29,9 @@ def transformer_of(inputs: StageInputs, part: str) -> CosmosCausalDiT:
     that they change nothing.
     """
     weights = start_weights(inputs, part)
-    if inputs.seen.source == "noise":
+    if inputs.conditioning.source == "noise":
         weights = widen_map(weights, 2 * LATENT)
-    if inputs.seen.opacity:
+    if inputs.conditioning.opacity:
         weights = with_opacity(weights)
     return CosmosCausalDiT.from_state_dict(
         weights, inputs.rope_ratios, source=f"initial weights of {part}"
