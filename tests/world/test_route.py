@@ -198,10 +198,11 @@ def turned_map(lane_map, angle):
     return make(*lanes)
 
 
-@pytest.mark.parametrize("angle", TURNS)
-def test_a_turned_world_has_the_same_route(angle):
+@pytest.mark.parametrize("angle", [*TURNS, np.radians(179.8)])
+@pytest.mark.parametrize("path", ["weaving", "slanting"])
+def test_a_turned_world_has_the_same_route(angle, path):
     x = np.arange(5.0, 60.0, 0.5)
-    log = drive(x, 0.3 * np.sin(x / 10))
+    log = drive(x, 0.3 * np.sin(x / 10) if path == "weaving" else 0.01 * (x - 30.0))
     yaw = yaw_from_quat(log.quat) + angle
     turned = Trajectory(log.t_us, turned_points(log.xyz, angle), quat_from_yaw(yaw))
     expected = route_from_log(ROAD, log)
