@@ -12,7 +12,7 @@ import grpc
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server import hosting
+from alpasim_plugin.alpasim.server import caches, hosting
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.caches import SceneCache
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService, _unknown_scene
@@ -245,6 +245,19 @@ def test_a_loaded_scene_is_served_while_another_loads_and_who_has_gone_does_not_
     leave.set()
     loading.join(10)
     assert scenes.loaded == [loaded, other]
+
+
+def test_the_scene_that_was_not_used_for_longest_goes_first(monkeypatch):
+    monkeypatch.setattr(caches, "KEPT_SCENES", 2)
+    scenes = SceneCache(["smoke/straight", "smoke/curve", "urban/s_bend"], None, False)
+    monkeypatch.setattr(scenes, "_load", lambda source: SimpleNamespace(source=source))
+    first, second, third = scenes.ids
+    kept = scenes.get(first)
+    scenes.get(second)
+    assert scenes.get(first) is kept
+    scenes.get(third)
+    assert scenes.loaded == [first, third]
+    assert scenes.get(first) is kept
 
 
 # --- sessions of a driver

@@ -129,6 +129,21 @@ def test_memory_is_bounded_and_the_drives_ends_go_last():
     assert kept.counts.starts == 1
 
 
+def test_a_frame_in_use_stays_and_one_unused_for_as_long_expires():
+    now_s = [0.0]
+    kept = tree(expiry_s=60.0, clock=lambda: now_s[0])
+    used, unused, *_ = views(2)
+    other = views(1, scene_id="other")[0]
+    for view in (used, unused, other):
+        now_s[0] += 1.0
+        serve(kept, view)
+    now_s[0] = 50.0
+    assert kept.find(used) is not None
+    now_s[0] = 70.0
+    kept.expire()
+    assert [kept.find(view) is not None for view in (used, unused, other)] == [True, False, False]
+
+
 def test_motion_is_continued_in_place_and_turn():
     a = se2(0, 0, 0.1)
     b = se2(1, 0.5, 0.2)

@@ -16,6 +16,7 @@ from alpasim_plugin.cameras.shutter import (
     between,
     motion_px,
     rolling,
+    rolling_exposure,
 )
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
@@ -122,3 +123,16 @@ def test_road_users_are_where_they_are_at_the_time_of_the_band():
 
 def test_a_picture_of_one_row_is_exposed_at_the_end():
     assert rolling(4, 1, "rows", False).tolist() == [[1.0]]
+
+
+def test_road_users_stand_at_the_shutters_start_where_they_were_then():
+    camera = replace(SPEC, shutter_us=30_000)
+    before = {"car": se2(2.0, 1.0, np.radians(170.0))}
+    now = {"car": se2(12.0, -4.0, np.radians(-170.0)), "newcomer": se2(5.0, 5.0, 0.3)}
+    exposure = rolling_exposure(camera, before, now, 100_000)
+    # 30 ms before the end of 100 ms: seven tenths of the way
+    expected = se2(9.0, -2.5, np.radians(-176.0))
+    assert_allclose(exposure.actors_start["car"], expected, atol=1e-9)
+    assert_allclose(exposure.actors_start["newcomer"], now["newcomer"], atol=1e-9)
+    assert exposure.share[0, 0] < exposure.share[-1, 0]
+    assert rolling_exposure(SPEC, before, now, 100_000) is None

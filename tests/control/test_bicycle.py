@@ -1,6 +1,7 @@
 """The vehicle model against its closed solution, at standstill, in reverse and at the limits."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,3 +166,10 @@ def test_accelerations_are_cut_to_what_the_vehicle_can():
 def test_senseless_input_is_refused(command, seconds):
     with pytest.raises(InputError):
         step(BicycleState(0.0, 0.0, 0.0, 1.0, 0.0), command, seconds, VEHICLE)
+
+
+def test_on_ice_reverse_gear_gets_no_more_grip_after_the_stop_than_before_it():
+    ice = replace(VEHICLE, friction=0.1)
+    begin = BicycleState(3.0, -2.0, 2.9, 0.001, 0.0)
+    done = step(begin, Command(0.0, drive_mps2=-3.0), 0.5, ice)
+    assert done.speed_mps == pytest.approx(0.001 - 0.981 * 0.5, abs=1e-9)

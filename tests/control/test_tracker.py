@@ -240,6 +240,37 @@ def test_perfect_controller_stands_on_the_plan_and_holds_its_last_pose():
     assert perfect.advance(held, plan, 5_100_000).speed_mps == 0.0
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_perfect_controller_turns_the_shorter_way_across_180_degrees(side):
+    perfect = make_controller("perfect", VEHICLE)
+    t = np.arange(0, 2.01, 0.1)
+    yaw = side * (np.radians(170) + 0.5 * t)
+    x = 10 * (np.sin(yaw) - np.sin(yaw[0])) * side
+    y = 10 * (np.cos(yaw[0]) - np.cos(yaw)) * side
+    state = at(yaw=yaw[0], speed=5.0)
+    for t_us in range(100_000, 1_000_001, 100_000):
+        state = perfect.advance(state, plan_of(t, x, y, yaw), t_us)
+        assert state.yaw_rate_radps == pytest.approx(side * 0.5, abs=1e-6)
+        assert state.speed_mps == pytest.approx(5.0, abs=1e-2)
+        assert state.steer_rad == pytest.approx(
+            side * np.arctan(VEHICLE.wheelbase_m / 10), abs=1e-3
+        )
+
+
+def test_perfect_controller_steers_to_the_same_side_in_reverse():
+    perfect = make_controller("perfect", VEHICLE)
+    t = np.arange(0, 2.01, 0.1)
+    yaw = np.radians(-172) - 0.5 * t  # backwards on a circle to the left
+    x = 10 * (np.sin(yaw) - np.sin(yaw[0]))
+    y = 10 * (np.cos(yaw[0]) - np.cos(yaw))
+    state = at(yaw=yaw[0], speed=-5.0)
+    for t_us in range(100_000, 1_000_001, 100_000):
+        state = perfect.advance(state, plan_of(t, x, y, yaw), t_us)
+        assert state.speed_mps == pytest.approx(-5.0, abs=1e-2)
+        assert state.yaw_rate_radps == pytest.approx(-0.5, abs=1e-6)
+        assert state.steer_rad == pytest.approx(np.arctan(VEHICLE.wheelbase_m / 10), abs=1e-3)
+
+
 def test_standing_start_reaches_the_planned_acceleration_and_place():
     t = np.arange(0, 10, 0.1)
     states = drive(plan_of(t, t * t, 0, 0), at(), 5.0)

@@ -58,6 +58,12 @@ def test_heading_of_180_degrees_wraps_to_the_lower_end():
     assert_allclose(yaw_from_quat(quat_from_yaw(np.array([3.0, -3.0]))), [3.0, -3.0])
 
 
+def test_the_heading_of_a_body_that_rolls_and_pitches_is_that_of_its_nose():
+    turns = Rotation.from_euler("ZYX", [[175.0, 8.0, -20.0], [-172.0, -10.0, 35.0]], degrees=True)
+    x, y, z, w = turns.as_quat().T
+    assert_allclose(yaw_from_quat(np.column_stack([w, x, y, z])), np.radians([175.0, -172.0]))
+
+
 @settings(deadline=None, max_examples=examples(50))
 @given(unit_quats, unit_quats, st.floats(0, 1))
 def test_slerp_agrees_with_scipy(q0, q1, fraction):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Signal
+from alpasim_plugin.runs.scoring import _placed as placed_events
 from evaluators import reduce_rollout, score
 from evaluators.metrics.motion import safe_distance_m
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, scored, track
@@ -127,3 +128,38 @@ def test_one_step_has_no_motion_and_says_so():
     found = scored(rollout(track(3.0, 0.0)))
     assert not found["hard_brake"].valid.any()
     assert found["uncomfortable"].reason == "the log has three steps or fewer"
+
+
+def test_the_safe_distance_behind_a_moving_car_counts_its_own_stopping_distance():
+    own_mps = np.array([20.0, 8.0, 10.0])
+    ahead_mps = np.array([10.0, 16.0, -12.0])
+    # by hand: v + 3.5 / 2 + (v + 3.5)^2 / (2 * 4) - ahead^2 / (2 * 8); what comes towards it stands
+    expected = [84.53125, 10.28125, 34.53125]
+    assert safe_distance_m(own_mps, ahead_mps) == pytest.approx(expected, abs=1e-9)
+
+
+def test_events_come_in_order_of_time_with_the_place_of_the_ego():
+    """The ego brakes hard and is run into from behind a second later."""
+    log = braking()
+    t = np.arange(N) * 0.1
+    follower = car("follows", track(np.minimum(-18.0 + 8.0 * t, 26.5), 0.0))
+    log = replace(log, actors=log.actors | {"follows": follower}, render_start_us=300_000)
+    found = scored(log)
+    reduction = reduce_rollout(list(found.values()), "strict")
+    brakes_us, hit_us = (
+        int(log.ego.t_us[np.argmax(found[name].value > 0)])
+        for name in ("hard_brake", "collision_rear")
+    )
+    assert 0 < brakes_us < hit_us
+    times = {event["metric"]: event["t_us"] for event in reduction.events}
+    assert (times["hard_brake"], times["collision_rear"]) == (brakes_us, hit_us)
+    assert list(times.values()) == sorted(times.values())
+    placed = placed_events(log, reduction)
+    keys = [(event["t_us"], event["metric"]) for event in placed]
+    assert keys == sorted(keys)
+    backwards = replace(reduction, events=reduction.events[::-1])
+    assert placed_events(log, backwards) == placed
+    for event in placed:
+        at = log.ego.xyz[log.ego.t_us == event["t_us"]][0]
+        assert (event["x_m"], event["y_m"]) == pytest.approx(at[:2], abs=1e-3)
+        assert event["t_s"] == pytest.approx((event["t_us"] - 300_000) * 1e-6)

@@ -182,3 +182,31 @@ def test_the_filter_is_scipys(window, order, times, longer):
     values = np.random.default_rng(longer).normal(size=window + longer).cumsum()
     want = scipy.signal.savgol_filter(values, window, order, times)
     np.testing.assert_allclose(savitzky_golay(values, window, order, times), want, atol=1e-12)
+
+
+def test_a_collision_is_the_first_contact_with_each_road_user_in_order_of_time():
+    n = 30
+    x = np.arange(n, dtype=float)
+    still = np.zeros((n, 2))
+    velocity = np.column_stack([np.full(n, 10.0), np.zeros(n)])
+    ego = EgoStates(
+        100_000 * np.arange(n), np.column_stack([x, 0 * x]), 0 * x, velocity, still, (5.0, 2.0), 1.5
+    )
+    places = [(20.0, "object"), (10.0, "object"), (15.0, "vehicle")]
+    users = Tracks(
+        ids=("far", "near", "middle"),
+        kinds=tuple(kind for _, kind in places),
+        there=np.ones((3, n), bool),
+        xy=np.array([np.tile([place, 0.0], (n, 1)) for place, _ in places]),
+        yaw=np.zeros((3, n)),
+        size=np.ones((3, 2)),
+        velocity=np.zeros((3, n, 2)),
+    )
+    hits = nuplan.collisions(ego, users)
+    # The nose is 4 m ahead of the rear axle, the side that it meets half a metre before the place.
+    assert [(hit.actor, hit.step) for hit in hits] == [(1, 6), (2, 11), (0, 16)]
+    assert all(hit.type == "stopped_track" and hit.at_fault for hit in hits)
+    assert nuplan.collision_score(hits) == 0.0
+    assert nuplan.collision_score(hits[:1]) == 0.5
+    assert nuplan.collision_score([hits[0], hits[2]]) == 0.0
+    assert nuplan.collision_score([]) == 1.0

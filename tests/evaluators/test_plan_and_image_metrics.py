@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.geometry import inverse, offset_trajectory, se2, se3, wrap_angle
 from alpasim_plugin.core.types import LoggedImage, LoggedPlan, Trajectory
 from evaluators import PRESETS, score
+from evaluators.metrics.collision import in_rig
+from evaluators.metrics.plan import trajectory_table
 from tests.evaluators.eval_build import (
     DT_US,
     T_RIG_BOX,
@@ -259,3 +261,25 @@ def test_equal_pictures_of_a_standing_car_are_not_frozen_but_creeping_on_behind_
         track(0.06 * np.arange(4), 0.0), images=[image(k * DT_US, 90) for k in range(4)]
     )
     assert scored(creeping)["img_is_frozen"].value.tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("yaw_deg", [175.0, -100.0])
+def test_plans_are_moved_to_a_box_that_is_turned_in_the_rig(yaw_deg):
+    T_rig_box = se2(1.4, 0.3, np.radians(10.0), 0.8)
+    poses = track([3.0, 4.0], [-2.0, 1.0], yaw=np.radians(yaw_deg))
+    origin = np.array([1.0, 2.0, 0.0])
+    table = trajectory_table([poses, poses], T_rig_box, origin, PRESETS["strict"])
+    expected = se3(poses.xyz, poses.quat) @ T_rig_box
+    for row, T_world_box in enumerate([*expected, *expected]):
+        assert table.xyz[row] == pytest.approx(T_world_box[:3, 3] - origin)
+        assert wrap_angle(table.yaw[row] - np.radians(yaw_deg + 10.0)) == pytest.approx(
+            0.0, abs=1e-9
+        )
+    assert table.start.tolist() == [0, 2, 4]
+
+
+def test_places_in_the_box_are_moved_to_a_rig_in_which_it_is_turned():
+    log = replace(rollout(drive(2)), T_rig_box=se2(1.4, 0.3, np.radians(170.0), 0.8))
+    xy = np.array([[2.0, 0.5], [-1.0, -0.7]])
+    places = np.column_stack([xy, np.zeros(2), np.ones(2)]) @ log.T_rig_box.T
+    np.testing.assert_allclose(in_rig(xy, log), places[:, :2], atol=1e-12)

@@ -71,6 +71,25 @@ def test_time_and_place_of_a_front_contact():
     assert values["contact_y_m"] == pytest.approx(0.22, abs=1e-5)
 
 
+def test_contacts_come_in_order_of_time_and_the_first_gives_time_and_place():
+    """The ego passes two posts at 10 m/s: one on its right, then one on its left, which the log
+    names first.
+    """
+    posts = {"far": (8.0, 0.9), "near": (5.5, -0.8)}
+    times_us = [0, 100_000, 200_000, 600_000]
+    actors = [car(name, track(x, y, t_us=times_us), POST) for name, (x, y) in posts.items()]
+    log = rollout(track([0.0, 1.0, 2.0, 6.0], 0.0, t_us=times_us), actors)
+    near_s, far_s = (0.1 * (posts[name][0] - 0.15 - HALF_L) for name in ("near", "far"))
+    events = contact_events(log)
+    assert [event.actor_id for event in events] == ["near", "far"]
+    assert [event.t_s for event in events] == pytest.approx([near_s, far_s], abs=1e-9)
+    found = scored(log)
+    assert found["contact_time_s"].value[-1] == pytest.approx(near_s, abs=1e-9)
+    assert found["contact_y_m"].value[-1] == pytest.approx(-0.795, abs=1e-5)
+    values = values_of(log, preset=STRICT)
+    assert values["contact_time_s"].value == pytest.approx(near_s, abs=1e-9)
+
+
 def test_without_contact_time_and_place_are_invalid_with_a_reason():
     log = rollout(track([0.0, 1.0], 0.0), [car("a", track(20.0, 0.0, n=2))])
     one = scored(log)["contact_time_s"]
@@ -181,6 +200,13 @@ def test_headings_turn_the_shorter_way_across_180_degrees():
     turning = track(0.0, 3.0, yaw=[math.radians(175), math.radians(-175)])
     log = rollout(track(0.0, 0.0, n=2), [car("a", turning, Box(8.0, 1.0, 1.0))])
     assert flag(log, "collision_any") == [0, 0]
+
+
+def test_the_ego_turns_the_shorter_way_across_180_degrees():
+    turning = track(0.0, 0.0, yaw=[math.radians(175), math.radians(-175)])
+    long_ego = Box(8.0, 1.0, 1.0)
+    beside = [car("left", track(0.0, 3.0, n=2)), car("right", track(0.0, -3.0, n=2))]
+    assert flag(rollout(turning, beside, box=long_ego), "collision_any") == [0, 0]
 
 
 def test_a_contact_before_the_handover_belongs_to_the_forced_rows():

@@ -3,6 +3,7 @@ is.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -265,3 +266,20 @@ def test_references_of_a_rolling_shutter_are_those_of_the_pose_at_each_row():
             images, references_of(found, replace(asked, T_world_camera=T), frame), strict=True
         ):
             assert_array_equal(image[band.rows], alone[band.rows])
+
+
+def test_a_frame_of_half_the_focal_length_counts_as_four_times_as_far_and_only_the_past_is_past():
+    wide = np.diag([0.5, 0.5, 1.0]) @ K
+    frames = [
+        RecordedFrame(t_us, camera, matrix, at(x), {}, None)
+        for t_us, camera, matrix, x in (
+            (1_000_000, "wide", wide, 1.0),
+            (1_000_000, "front", K, 3.0),
+            (900_000, "front", K, 3.5),
+        )
+    ]
+    index = ReferenceIndex(frames)
+    choose = partial(index.choose, at(0.0), 1_000_000, 3)
+    assert choose(focal_px=40.0)[0] == 1
+    assert choose(focal_px=20.0)[0] == 0
+    assert choose(focal_px=40.0, past=True) == (2,)

@@ -5,7 +5,7 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.cloud import all_rigid, require_rigid
+from alpasim_plugin.gaussians.cloud import all_rigid, placed_cloud, require_rigid
 from tests.gaussians.gaussian_scenes import covariances, random_cloud, random_rigid
 
 
@@ -141,3 +141,13 @@ def test_a_gaussian_with_two_faults_is_counted_once():
     data["quats"][0] = 0
     _, report = GaussianCloud.cleaned(**data)
     assert sum(report.dropped.values()) == 1
+
+
+def test_a_model_in_other_units_is_placed_with_its_splats_scaled_and_turned():
+    cloud = random_cloud(8)
+    T = random_rigid(3)
+    T[:3, :3] *= 2.5
+    placed = placed_cloud(cloud, T)
+    np.testing.assert_allclose(placed.means, cloud.means @ T[:3, :3].T + T[:3, 3], atol=1e-4)
+    expected = T[:3, :3] @ covariances(cloud) @ T[:3, :3].T
+    np.testing.assert_allclose(covariances(placed), expected, atol=1e-4)

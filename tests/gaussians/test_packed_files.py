@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import matrix_from_quat, unit
 from alpasim_plugin.gaussians import read_ply
-from alpasim_plugin.gaussians.cloud import quat_multiply
+from alpasim_plugin.gaussians.cloud import GaussianArrays, quat_multiply
 from alpasim_plugin.gaussians.files import read_gaussians
 from alpasim_plugin.gaussians.files.packed import (
+    DIRECTIONS,
+    in_ply_axes,
     read_compressed_ply,
     read_splat,
     read_spz,
@@ -204,3 +207,19 @@ def test_chunks_that_do_not_cover_the_gaussians_are_refused(tmp_path):
     path = write_compressed(tmp_path / "a.compressed.ply", 257, 1, (0, 0, 0, 0))
     with pytest.raises(InputError):
         read_compressed_ply(path)
+
+
+@pytest.mark.parametrize("system", ["RUB", "LUF", "FLU", "BRU", "RFU"])
+def test_an_ellipsoid_in_other_axes_keeps_its_place_and_its_shape(system):
+    means = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]], np.float32)
+    quats = unit(np.array([[0.9, 0.3, -0.2, 0.1], [0.2, -0.6, 0.5, 0.7]])).astype(np.float32)
+    scales = np.array([[0.1, 0.2, 0.4], [0.3, 0.05, 0.6]], np.float32)
+    sh = np.zeros((2, 1, 3), np.float32)
+    arrays = GaussianArrays(means, quats, scales, np.ones(2), sh)
+    M = np.array([DIRECTIONS[letter] for letter in system], np.float64).T
+    turned = in_ply_axes(arrays, system)
+    assert_allclose(turned.means, means @ M.T, atol=1e-6)
+    for row in range(2):
+        before = matrix_from_quat(quats[row]) * scales[row]
+        after = matrix_from_quat(turned.quats[row]) * scales[row]
+        assert_allclose(after @ after.T, M @ before @ before.T @ M.T, atol=1e-6)

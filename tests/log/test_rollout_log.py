@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import yaw_from_quat
+from alpasim_plugin.core.types import Frame
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
 from alpasim_plugin.log.asl import AslReader
 from tests.log.make_rollout import (
@@ -185,3 +186,42 @@ def test_log_without_context_before_the_first_frame_has_no_double_time(tmp_path)
         log.begin([CAMERA])
         log.actor_poses(T0_US, ego_at(0).T_world_rig, present(T0_US))
     assert read_asl(tmp_path / "a.asl").ego.t_us.tolist() == [T0_US]
+
+
+def test_images_of_two_cameras_come_back_in_order_of_time(tmp_path):
+    side = replace(CAMERA, name="camera_cross_left_120fov")
+    with AslWriter(tmp_path / "a.asl", HEADER) as log:
+        log.begin([CAMERA, side])
+        log.actor_poses(T0_US + STEP_US, ego_at(1).T_world_rig, present(T0_US + STEP_US))
+        for camera, steps in ((CAMERA, (3, 1, 4)), (side, (2, 0))):
+            for step in steps:
+                frame = Frame(T0_US + step * STEP_US, camera.name, picture(step))
+                log.camera_image(frame, "png", camera.shutter_us)
+    images = read_asl(tmp_path / "a.asl").images
+    assert [(image.end_us - T0_US) // STEP_US for image in images] == [0, 1, 2, 3, 4]
+    assert [image.camera for image in images] == [
+        side.name,
+        CAMERA.name,
+        side.name,
+        CAMERA.name,
+        CAMERA.name,
+    ]
+    for step, image in enumerate(images):
+        assert_array_equal(decode_image(image.data), picture(step))
+
+
+def test_answers_of_a_slow_driver_belong_to_the_oldest_open_request(tmp_path):
+    with AslWriter(tmp_path / "a.asl", HEADER) as log:
+        log.begin([CAMERA])
+        log.actor_poses(T0_US + STEP_US, ego_at(1).T_world_rig, present(T0_US + STEP_US))
+        for step in (1, 2, 3):
+            log.driver_request(T0_US + step * STEP_US, T0_US + (step + 1) * STEP_US)
+        for step in (1, 2):
+            log.driver_return(plan_at(step))
+    log = read_asl(tmp_path / "a.asl")
+    assert [plan.now_us for plan in log.plans] == [T0_US + STEP_US, T0_US + 2 * STEP_US]
+    assert [plan.query_us - plan.now_us for plan in log.plans] == [STEP_US, STEP_US]
+    for step, plan in zip((1, 2), log.plans, strict=True):
+        assert plan.trajectory.t_us[0] == plan.now_us
+        assert_allclose(plan.trajectory.xyz, plan_at(step).xyz, atol=1e-6)
+    assert log.info["unanswered"] == 1

@@ -199,8 +199,10 @@ def grey(value):
 
 def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, monkeypatch):
     run = read_run(three)
-    first = run.rollouts[0]
     scene = run.scenes[0]
+    first = [one for one in run.rollouts if one.scene == scene][-1]  # of the last seed
+    for one in run.rollouts:
+        (run.folder / one.path / "rollout.asl").touch()
     rollouts = []
     for one in run.rollouts:
         if (one.scene, one.seed) == (scene, first.seed):
@@ -220,7 +222,14 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
         for camera, level in (("front", 50), ("left", 20))
     ]
     log = SimpleNamespace(images=images, render_start_us=500_000)
-    monkeypatch.setattr(worst, "read_log", lambda path: log)
+    darker = [
+        SimpleNamespace(camera=image.camera, end_us=image.end_us, data=grey(10)) for image in images
+    ]
+    of_other_seeds = SimpleNamespace(images=darker, render_start_us=500_000)
+    folders = {run.folder / one.path for one in rollouts}
+    monkeypatch.setattr(
+        worst, "read_log", lambda path: log if path.parent in folders else of_other_seeds
+    )
     shots = worst.worst_change(run)
     assert [shot.variant for shot in shots] == ["clean", "3dgs", "onefixer"]
     assert {(shot.scene, round(shot.t_s, 3)) for shot in shots} == {(scene, 2.8)}
@@ -228,6 +237,20 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
         data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
         upper, lower = np.split(cv2.imdecode(data, cv2.IMREAD_COLOR), 2)
         np.testing.assert_allclose((upper.mean(), lower.mean()), (150.0, 60.0), atol=3)
+
+
+def test_the_worst_rollout_failed_or_is_the_farthest_from_its_path(three):
+    first = read_run(three).rollouts[0]
+    unhurt = first.metrics | {"collision_any": 0.0, "collision_at_fault": 0.0, "offroad": 0.0}
+    near, far, hit = (
+        dataclasses.replace(first, metrics=unhurt | metrics)
+        for metrics in (
+            {"lateral_distance_m": 0.4},
+            {"lateral_distance_m": 1.9},
+            {"lateral_distance_m": 0.1, "collision_any": 1.0, "collision_at_fault": 1.0},
+        )
+    )
+    assert sorted((near, far, hit), key=worst._rank) == [hit, far, near]
 
 
 def test_a_missing_number_is_a_dash_and_never_zero(tmp_path):

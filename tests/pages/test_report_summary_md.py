@@ -38,3 +38,12 @@ def test_cut_keeps_within_the_limit_and_stays_text(text, limit):
     else:
         assert done.endswith(CUT_NOTE)
         assert text.startswith(done.removesuffix(CUT_NOTE))
+
+
+def test_cut_leaves_room_for_its_note_and_takes_no_more_than_that():
+    text = "".join(f"row {i:04d} of a table \u2014 its name\n" for i in range(400))
+    row = len(text.splitlines(keepends=True)[0].encode())
+    for limit in (1000, 1001, 1017, 5000):
+        done = cut(text, limit)
+        assert limit - row < len(done.encode()) <= limit
+        assert text.startswith(done.removesuffix(CUT_NOTE))

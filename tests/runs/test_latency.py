@@ -56,3 +56,14 @@ def test_the_fixer_counts_only_where_asked_for():
     now = plan(0)
     queue.submit(now, 0, wall_us=5_000)
     assert queue.active(5_000) is now
+
+
+def test_a_copy_of_the_queue_goes_its_own_way():
+    queue = PlanQueue(Latency("fixed", 50_000))
+    now = plan(0)
+    queue.submit(now, 0, 0)
+    ahead = queue.copy()
+    assert ahead.active(60_000) is now
+    ahead.submit(plan(60_000), 60_000, 0)
+    assert queue.active(40_000) is None
+    assert queue.active(500_000) is now

@@ -13,17 +13,18 @@ T_US = (
 )  # epoch times: too long for a float's mantissa
 
 
-def circle(speed_mps, radius_m):
-    """Drive a left circle from the origin along x."""
+def circle(speed_mps, radius_m, yaw_rad=0.0):
+    """Drive a left circle that begins with a heading."""
     s = speed_mps * (T_US - T_US[0]) * 1e-6
-    yaw = s / radius_m
+    yaw = yaw_rad + s / radius_m
     xyz = np.stack([radius_m * np.sin(yaw), radius_m * (1 - np.cos(yaw)), np.zeros(len(s))], axis=1)
     return Trajectory(T_US, xyz, quat_from_yaw(yaw))
 
 
-def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends():
+@pytest.mark.parametrize("yaw_rad", [0.0, np.radians(172.0)])
+def test_a_circle_has_its_speed_yaw_rate_and_steering_up_to_its_ends(yaw_rad):
     vehicle = Vehicle()
-    for one in ego_states_from_log(circle(8.0, 40.0), T_US, vehicle):
+    for one in ego_states_from_log(circle(8.0, 40.0, yaw_rad), T_US, vehicle):
         assert one.speed_mps == pytest.approx(8.0, rel=1e-3)
         assert one.yaw_rate_radps == pytest.approx(0.2, rel=1e-6)
         assert one.steer_rad == pytest.approx(np.arctan(vehicle.wheelbase_m / 40.0), rel=2e-3)

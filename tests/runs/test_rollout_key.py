@@ -58,3 +58,12 @@ def test_a_fixers_weights_count_by_their_bytes_and_not_by_their_place(tmp_path):
     assert fixed_key(f"weights.bundle={moved}") == key
     assert fixed_key(f"weights.bundle={other}") != key
     assert fixed_key("history=last-forward") != key
+
+
+def test_how_images_are_stored_is_part_of_every_key():
+    refs = expand("smoke/straight", ("timing.duration_us=1200000",))
+    keys = set()
+    for images in ("none", "jpeg", "png"):
+        plan = make_plan(refs, ("clean",), ("pure-pursuit",), (0, 1), RunOptions(images=images))
+        keys |= {cell.rollout_key for cell in plan.cells}
+    assert len(keys) == 6

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from alpasim_plugin.core.geometry import speeds, yaw_from_quat
-from alpasim_plugin.core.types import Box
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, speeds, yaw_from_quat
+from alpasim_plugin.core.types import Actor, Box, EgoState, Trajectory, Vehicle
 from alpasim_plugin.world.path import polyline_path
+from alpasim_plugin.world.walkers import MARGIN_M, Walker
 from scenarios.ego_path import driven_m, grid, standing_track, track_on_path, walk_track
 from scenarios.load import load_scenario
 
@@ -68,3 +69,54 @@ def test_standing_track_covers_the_whole_time():
     track = standing_track(np.array([1.0, 2.0, 0.5]), 0.3, grid(5_000_000), BOX)
     assert track.t_us.tolist() == [0, 5_000_000]
     assert track.xyz[0].tolist() == [1.0, 2.0, 1.25]
+
+
+@pytest.mark.parametrize(("side", "before_ego_s"), [("right", 0.0), ("left", 1.5)])
+def test_a_pedestrian_reaches_the_middle_of_the_egos_line_before_the_egos_front(
+    tmp_path, side, before_ego_s
+):
+    scene = (
+        "version: 1\nroad: {lanes_forward: 2, segments: [{kind: straight, length_m: 300}]}\n"
+        "ego: {lane: 0, start_m: 10, speed_mps: 8, cruise_mps: 8}\n"
+        "timing: {duration_us: 12000000}\n"
+    )
+    crossing = f"{{kind: crossing_pedestrian, id: p, s_m: 60, side: {side}, before_ego_s: %s}}"
+    (tmp_path / "empty.yaml").write_text(scene)
+    (tmp_path / "a.yaml").write_text(f"{scene}actors: [{crossing % before_ego_s}]\n")
+    log = load_scenario(tmp_path / "empty.yaml").ego_log  # undisturbed
+    scenario = load_scenario(tmp_path / "a.yaml")
+    vehicle = scenario.vehicle
+    front_m = log.xyz[:, 0] + vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
+    (walker,) = scenario.actors
+    track = walker.track
+    arrival_us = np.interp(track.xyz[0, 0], front_m, log.t_us)
+    aside_m = track.xyz[:, 1] - log.xyz[0, 1]
+    rising = 1.0 if side == "right" else -1.0
+    middle_us = np.interp(0.0, rising * aside_m, track.t_us)
+    # The walk begins and ends gently: it loses some tenths of a second to a walk at full speed.
+    assert middle_us * 1e-6 == pytest.approx(arrival_us * 1e-6 - before_ego_s, abs=0.25)
+
+
+@pytest.mark.parametrize("yaw", np.radians([175.0, -60.0]))
+def test_a_walker_waits_for_a_body_that_reaches_from_its_centre_to_both_ends(yaw):
+    vehicle = Vehicle()
+    ego = EgoState(0, se2(30.0, -20.0, yaw), 0.0)
+    half_m = vehicle.box.length_m / 2 + 0.3 + MARGIN_M
+    ends = [vehicle.rear_axle_to_centre_m + sign * half_m for sign in (-1.0, 1.0)]
+    for at_m, waits in (
+        (ends[0] - 0.1, False),
+        (ends[0] + 0.1, True),
+        (ends[1] - 0.1, True),
+        (ends[1] + 0.1, False),
+    ):
+        # Across the ego's way, from 5 m on its left to 5 m on its right, at 5 m/s.
+        across_m = np.linspace(5.0, -5.0, 21)
+        in_rig = np.column_stack([np.full(21, at_m), across_m, np.zeros(21), np.ones(21)])
+        xyz = (in_rig @ ego.T_world_rig.T)[:, :3]
+        track = Trajectory(
+            np.arange(21) * 100_000, xyz, quat_from_yaw(np.full(21, yaw - np.pi / 2))
+        )
+        walker = Walker(Actor("p", "person", Box(0.6, 0.6, 1.8), track))
+        walker.step(0, 100_000, ego, vehicle)
+        assert (walker.rate < 1.0) == waits
+        assert walker.lag_us == pytest.approx(10_000 if waits else 0)

@@ -94,6 +94,21 @@ def test_projection_beyond_the_ends_follows_the_tangent():
     assert_allclose(d, [1.0, -2.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("curvature", [0.08, -0.05])
+@pytest.mark.parametrize("along", [-6.0, 6.0])
+def test_projection_beyond_an_end_of_a_bend_leaves_the_bend(curvature, along):
+    curve = sample_clothoid((10.0, -3.0, 2.9), 40.0, curvature, curvature)
+    path = smooth_path(np.column_stack([curve[:, :2], np.zeros(len(curve))]), step_m=0.5)
+    end = 0 if along < 0 else -1
+    yaw = path.yaw[end]
+    tangent = np.array([np.cos(yaw), np.sin(yaw)])
+    left = np.array([-tangent[1], tangent[0]])
+    point = path.xyz[end, :2] + along * tangent + 1.5 * left
+    s, d = path.project(point[None])
+    assert_allclose(s, path.s[end] + along, atol=1e-6)
+    assert_allclose(d, 1.5, atol=1e-6)
+
+
 def test_path_of_one_point_is_refused():
     with pytest.raises(InputError):
         polyline_path(np.zeros((3, 3)))

@@ -1,10 +1,18 @@
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from alpasim_plugin.core.geometry import arc_lengths, project, quat_from_yaw, se2, se3
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    project,
+    quat_from_yaw,
+    se2,
+    se3,
+    yaw_from_quat,
+)
 from alpasim_plugin.core.types import Route, Trajectory
 from alpasim_plugin.world.route import (
     LaneIndex,
@@ -166,3 +174,58 @@ def test_way_points_lie_level_in_a_pitched_rig():
         Route(np.array([[0.0, 0, 0], [200.0, 0, 20.0]])), se3([10.0, 0.0, 1.0], pitch)
     )
     assert (seen[:, 2] == 0).all()
+
+
+# Headings on both sides of 180 degrees, and one elsewhere.
+TURNS = np.radians([175.0, 179.0, 184.0, 90.0])
+
+
+def turned_points(points, angle):
+    """Points ``(N, 3)`` turned about the vertical axis through the origin."""
+    return points @ se2(0.0, 0.0, angle)[:3, :3].T
+
+
+def turned_map(lane_map, angle):
+    lanes = [
+        replace(
+            lane,
+            centre=turned_points(lane.centre, angle),
+            left=turned_points(lane.left, angle),
+            right=turned_points(lane.right, angle),
+        )
+        for lane in lane_map.lanes.values()
+    ]
+    return make(*lanes)
+
+
+@pytest.mark.parametrize("angle", [*TURNS, np.radians(179.8)])
+@pytest.mark.parametrize("path", ["weaving", "slanting"])
+def test_a_turned_world_has_the_same_route(angle, path):
+    x = np.arange(5.0, 60.0, 0.5)
+    log = drive(x, 0.3 * np.sin(x / 10) if path == "weaving" else 0.01 * (x - 30.0))
+    yaw = yaw_from_quat(log.quat) + angle
+    turned = Trajectory(log.t_us, turned_points(log.xyz, angle), quat_from_yaw(yaw))
+    expected = route_from_log(ROAD, log)
+    route = route_from_log(turned_map(ROAD, angle), turned)
+    assert route.lane_ids == expected.lane_ids == ("a", "b", "c")
+    assert_allclose(route.xyz, turned_points(expected.xyz, angle), atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", TURNS)
+def test_a_bend_of_ten_degrees_is_straighter_than_a_turn_at_every_heading(angle):
+    fork = make(
+        straight("b", 40, 80, successors=("turn", "bend")),
+        arc("bend", 100.0, 10.0, start=(80, 0)),
+        arc("turn", 12.0, 90.0, start=(80, 0)),
+    )
+    assert LaneIndex(turned_map(fork, angle)).straightest_successor("b") == "bend"
+
+
+@pytest.mark.parametrize("angle", TURNS)
+def test_a_turned_route_over_itself_is_followed_in_the_ego_s_direction(angle):
+    eight = np.array([[-50.0, 0, 0], [50.0, 0, 0], [50.0, 50, 0], [0.0, 50, 0], [0.0, -50, 0]])
+    T_turned = se2(0.0, 0.0, angle)
+    for pose in (se2(0.0, 0.2, np.radians(8.0)), se2(0.2, 0.0, np.radians(-82.0))):
+        seen = route_in_rig(Route(turned_points(eight, angle)), T_turned @ pose)
+        assert_allclose(seen, route_in_rig(Route(eight), pose), atol=1e-6)
+        assert seen[5, 0] > 0.9 * 5 * 80 / 19

@@ -1,12 +1,14 @@
 """Where a driver has to let others pass."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from alpasim_plugin.core.types import Box, Signal
 from alpasim_plugin.world.idm import IdmParams, bend_speeds, bodies_from
 from alpasim_plugin.world.path import polyline_path, smooth_path
-from alpasim_plugin.world.signals import give_way_gap_m, lights_on
+from alpasim_plugin.world.signals import give_way_gap_m, lights_on, red_gap_m
 
 NORTH = polyline_path(np.column_stack([np.zeros(101), np.arange(-50.0, 51.0), np.zeros(101)]))
 LINE = Signal(np.array([[-2.0, -6.0, 0.0], [2.0, -6.0, 0.0]]), np.pi / 2, ())
@@ -48,3 +50,14 @@ def test_a_driver_slows_down_before_a_bend_and_creeps_around_a_corner():
     assert (np.diff(wanted**2) / np.diff(path.s)).min() > -3.1
     assert bend_speeds(path, IdmParams(12.0)) is None
     assert bend_speeds(path, IdmParams(12.0, lateral_accel_mps2=1e-3)).min() == 2.0
+
+
+def test_a_yellow_light_is_one_to_stop_at_where_the_brake_is_enough_for_it():
+    crossing = replace(LINE, phases=(("yellow", 3_000_000), ("red", 3_000_000)))
+    lights = lights_on(NORTH, [crossing])  # the line is 44 m along the path
+    speed_mps = 12.0  # stops within 12^2 / (2 * 3) = 24 m
+    for gap_m, stops in ((23.9, False), (24.1, True), (40.0, True)):
+        met = red_gap_m(lights, 44.0 - gap_m, speed_mps, 1_000_000)
+        assert met == (pytest.approx(gap_m) if stops else float("inf"))
+    assert red_gap_m(lights, 43.0, speed_mps, 4_000_000) == pytest.approx(1.0)
+    assert red_gap_m(lights, 44.5, speed_mps, 4_000_000) == float("inf")
