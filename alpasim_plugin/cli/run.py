@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -185,8 +185,8 @@ def run(
                 "Name every scenario once.",
             )
         listed[found] = item
-    # What two suites list is one scene, before shards are cut: or two shards would drive it.
-    refs = list(dict.fromkeys(chain.from_iterable(listed)))
+    # Before shards are cut: or two of them would drive a scene that two suites list.
+    refs = distinct(chain.from_iterable(listed))
     if shard is not None:
         refs = shard_of(refs, shard)
     planned = partial(
@@ -268,6 +268,14 @@ def run(
             names = ", ".join(plan.undigested)
             warn(f"--resume reuses the rollouts of {names}; the same command drives them again.")
     raise typer.Exit(result.exit_code)
+
+
+def distinct(refs: Iterable[ScenarioRef]) -> list[ScenarioRef]:
+    """Return scenes without those that stand there before, whatever path leads to their file."""
+    scenes: dict[ScenarioRef, ScenarioRef] = {}
+    for ref in refs:
+        scenes.setdefault(replace(ref, path=os.path.realpath(ref.path)), ref)
+    return [*scenes.values()]
 
 
 def shard_of(refs: Sequence[ScenarioRef], shard: str) -> list[ScenarioRef]:
