@@ -126,7 +126,7 @@ def test_no_module_binds_a_name_twice():
 # Module -> why it opens files by itself.
 READERS = {
     "alpasim_plugin.core.files.reading": "it is the reader",
-    "alpasim_plugin.cli.main": "the null device",
+    "alpasim_plugin.core.printing": "the null device",
     "alpasim_plugin.core.files.arrays": "memory maps, after `check_regular`",
     "alpasim_plugin.core.files.tables": "parquet, after `check_regular`",
     "alpasim_plugin.core.files.atomic": "what it has just written",

@@ -8,7 +8,6 @@ torch, which takes seconds to load.
 import contextlib
 import difflib
 import errno
-import json
 import os
 import re
 import sys
@@ -34,7 +33,14 @@ from alpasim_plugin.core.errors import (
 )
 from alpasim_plugin.core.files.places import damaged_kernels
 from alpasim_plugin.core.lazy import installed_names
-from alpasim_plugin.core.printing import print_any_character, say, warn
+from alpasim_plugin.core.printing import (
+    drop_unwritten,
+    keep_stdout_for_document,
+    print_any_character,
+    say,
+    say_document,
+    warn,
+)
 
 THREADS_S = 2.0  # for threads of parts, after the last line is printed
 
@@ -114,6 +120,9 @@ PANELS: dict[str, dict[str, tuple[str, str]]] = {
         "docs": ("docs:docs", "Read a page of the documentation in the terminal, or list all."),
     },
 }
+# Options whose value may be a list, or in brackets hold one.
+LISTS = ("--renderer", "--policy", "--seeds", "--preset", "--set", "--fixer", "--split")
+OUR_VERBS = "alpasim_plugin."  # what their modules' names begin with
 PLUGIN_PANEL = "From installed packages"
 PLUGIN_GROUP = "simrun.commands"
 # Verbs that an optional package of ours brings.
@@ -227,19 +236,32 @@ def own_options(
 
 def usual(args: list[str]) -> list[str]:
     """Return a command line in one form: ``help VERB`` and ``version`` as options, a list with
-    spaces beside its commas as one word, ``-j`` and ``-q`` behind the verb.
+    spaces beside its commas as one word where an option takes one, ``-j`` and ``-q`` behind the
+    verb.
 
     Example:
         >>> usual(["help", "list"]), usual(["--renderer", "clean,", "3dgs", "smoke/curve"])
         (['list', '--help'], ['--renderer', 'clean,3dgs', 'smoke/curve'])
+
+    Raises:
+        InputError: A comma stands between two words of which no list is made.
     """
     words: list[str] = []
     for word in args:
         is_seeds = words[-2:-1] == ["--seeds"] and not word.strip(",").isdecimal()
-        if words and not is_seeds and (words[-1].endswith(",") or word.startswith(",")):
-            words[-1] += word
-        else:
+        has_comma = bool(words) and (words[-1].endswith(",") or word.startswith(","))
+        if is_seeds or not has_comma or word.startswith("-"):
             words.append(word)
+            continue
+        option, equals, _ = words[-1].partition("=")
+        if not equals or not option.startswith("-"):
+            option = words[-2] if len(words) > 1 else ""
+        if option not in LISTS:
+            raise InputError(
+                f"{words[-1]} {word}: a comma between two words, where no list stands",
+                "Write spaces alone; after a name that ends with a comma write a slash.",
+            )
+        words[-1] += word
     if words[:1] == ["help"]:
         is_known = len(words) == 1 or words[1] in verbs()
         return [*words[1:2], "--help"] if is_known else words[1:2]
@@ -281,17 +303,39 @@ def with_verb(args: list[str]) -> list[str]:
     return ["run", *args]
 
 
+def asks_json(args: list[str]) -> bool:
+    """Tell whether a command line asks for one JSON document.
+
+    Example:
+        >>> asks_json(["list", "presets", "-qj"]), asks_json(["list", "presets", "-q"])
+        (True, False)
+    """
+    return any(word == "--json" or re.fullmatch(r"-[jq]*j[jq]*", word) for word in args)
+
+
+def _document_is_ours(args: list[str]) -> bool:
+    """Tell whether the command writes one JSON document through `say_document`; a verb of another
+    package prints by itself.
+    """
+    if not asks_json(args):
+        return False
+    try:
+        verb = "".join(usual(args)[:1])
+        return verbs().get(verb, OUR_VERBS).startswith(OUR_VERBS)
+    except SimrunError:
+        return True
+
+
 def _run(args: list[str]) -> int:
     """Parse and run one command line; errors of usage are `InputError`."""
     args = usual(args)
     if args[:1] == ["--version"]:
         from alpasim_plugin import __version__
 
-        say(
-            json.dumps({"version": __version__})
-            if {"--json", "-j"} & {*args}
-            else f"simrun {__version__}"
-        )
+        if asks_json(args):
+            say_document({"version": __version__})
+        else:
+            say(f"simrun {__version__}")
         return 0
     try:
         os.getcwd()
@@ -342,7 +386,7 @@ def run_command(args: list[str]) -> int:
             return PIPE_CLOSED  # rich leaves with 1, which would read as a failed gate
         return leaving.code if isinstance(leaving.code, int) else 2 * (leaving.code is not None)
     except BrokenPipeError:
-        _drop_unwritten_output()
+        drop_unwritten()
         return PIPE_CLOSED
     except (SimrunError, Stopped) as error:
         failure = error
@@ -354,12 +398,11 @@ def run_command(args: list[str]) -> int:
     if "--debug" in args and isinstance(failure, SimrunError):
         warn(*"".join(traceback.format_exception(failure)).splitlines())
     with contextlib.suppress(OSError):  # nobody can be told; the exit code still says it
-        if {"--json", "-j"} & {*args}:
-            facts = {"error": failure.as_dict(), "exit_code": failure.exit_code}
-            say(json.dumps(facts))
+        if asks_json(args):
+            say_document({"error": failure.as_dict(), "exit_code": failure.exit_code})
         else:
             warn(*str(failure).splitlines())
-    _drop_unwritten_output()
+    drop_unwritten()
     return failure.exit_code
 
 
@@ -388,23 +431,14 @@ def _unforeseen(error: BaseException, command: str) -> SimrunError:
     return InternalError.of(error, command)
 
 
-def _drop_unwritten_output() -> None:
-    """Drop what was printed and cannot be written, so that Python does not fail on it at its
-    end.
-    """
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError, AttributeError):
-        with contextlib.suppress(OSError, ValueError, AttributeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
     print_any_character()
     if COMPLETION in os.environ:
         app(prog_name="simrun")
+    if _document_is_ours(sys.argv[1:]):
+        keep_stdout_for_document()
     code = run_command(sys.argv[1:])
     _leave_threads_behind(code)
     sys.exit(code)
@@ -423,7 +457,7 @@ def _leave_threads_behind(code: int) -> None:
         from alpasim_plugin.alpasim.client.child import end_children  # only where a part ran
 
         end_children()
-        _drop_unwritten_output()
+        drop_unwritten()
         os._exit(code)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import time
@@ -17,7 +16,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.files.stage import stages_in
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.printing import say
+from alpasim_plugin.core.printing import say, say_document
 from alpasim_plugin.core.printing import warn as warn
 from alpasim_plugin.log.run_folder.schema import STAGES
 from evaluators.statistics.numbers import plural
@@ -40,7 +39,7 @@ LINE_EVERY_S = 10.0  # on a pipe, within one stage
 def show(as_json: bool, facts: JsonView, *lines: Any) -> None:
     """Print a result: its facts as one JSON document, or lines of text and tables of rich."""
     if as_json:
-        say(json.dumps(facts))
+        say_document(facts)
         return
     for line in lines:
         if isinstance(line, str):

@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -285,7 +285,15 @@ def _scenes(
                 "Name every scenario once.",
             )
         name_by_refs[refs] = name
-    return list(dict.fromkeys(chain.from_iterable(name_by_refs)))
+    return distinct(chain.from_iterable(name_by_refs))
+
+
+def distinct(refs: Iterable[ScenarioRef]) -> list[ScenarioRef]:
+    """Return scenes without those that stand there before, whatever path leads to their file."""
+    scenes: dict[ScenarioRef, ScenarioRef] = {}
+    for ref in refs:
+        scenes.setdefault(replace(ref, path=os.path.realpath(ref.path)), ref)
+    return [*scenes.values()]
 
 
 def shard_of(refs: Sequence[ScenarioRef], shard: str) -> list[ScenarioRef]:

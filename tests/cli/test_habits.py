@@ -62,10 +62,19 @@ def here(tmp_path, monkeypatch):
         ("-j list presets", "list -j presets"),
         ("--renderer clean, 3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
         ("--renderer clean ,3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
+        ("--set a=[1, 2] smoke/curve", "--set a=[1,2] smoke/curve"),
     ],
 )
 def test_other_spellings_are_understood(typed, meant):
     assert usual(typed.split()) == meant.split()
+
+
+@pytest.mark.parametrize(
+    "line", ["--out d, smoke/curve", "--out=d, smoke/curve", "smoke/curve, smoke/straight"]
+)
+def test_a_comma_where_no_list_stands_is_named(line, capsys):
+    assert run_command(line.split()) == 2
+    assert "a comma between two words" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

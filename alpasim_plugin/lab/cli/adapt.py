@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.fixers import fixer_settings
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from alpasim_plugin.lab.cli import training_options as options
@@ -71,7 +71,7 @@ def adapt(
         else f"not accepted: {gain_text}; nothing is written, what you had is kept"
     )
     if as_json:
-        print(json.dumps({**asdict(done), "weights": str(out) if done.accepted else None}))
+        say_document({**asdict(done), "weights": str(out) if done.accepted else None})
     else:
         Console().print(verdict, highlight=False, markup=False, soft_wrap=True)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from alpasim_plugin.core.files.atomic import write_json
+from alpasim_plugin.core.printing import say_document
 
 EPILOG = (
     "Examples: `simrun bench loop`, `simrun bench loop --renderer 3dgs,onefixer@2 --out loop.json`"
@@ -41,4 +41,7 @@ def loop(
     record = bench_loop(renderers.split(","), repeats, seconds)
     if out is not None:
         write_json(out, record)
-    print(json.dumps(record) if as_json else markdown(record))
+    if as_json:
+        say_document(record)
+    else:
+        print(markdown(record))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +12,7 @@ from rich.console import Console
 from alpasim_plugin.cli.options import fixer_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, split_names, split_settings
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.lab.bench.quality import (
     RAW,
     InputKind,
@@ -143,7 +143,10 @@ def quality(
             console.print(f"{i}/{n} {work.variant.label} {work.folder.name}{value}")
 
     summary = measure_quality(works, baseline, jobs, out, report)
-    print(json.dumps(summary) if as_json else f"{markdown(summary)}\nwrote {out / 'quality.json'}")
+    if as_json:
+        say_document(summary)
+    else:
+        print(f"{markdown(summary)}\nwrote {out / 'quality.json'}")
 
 
 def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.console import Console
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.parts import RendererSpec, resolve_renderer, split_names
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.real import (
@@ -88,7 +88,7 @@ def real(
             highlight=False,
         )
     if as_json:
-        print(json.dumps({"rows": rows, **({"intervals": over} if over else {})}))
+        say_document({"rows": rows, **({"intervals": over} if over else {})})
         return
     print_rows(rows, False)
     if over:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from alpasim_plugin.core.printing import say_document
+
 
 def print_rows(rows: Sequence[Mapping[str, Any]], as_json: bool) -> None:
     """Print rows of equal keys; numbers with three digits, nothing for None."""
     if as_json:
-        print(json.dumps(rows))
+        say_document(rows)
         return
     table = Table(box=None, header_style="bold")
     for name in rows[0]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.lab.cli.image_sizes import parse_size
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, Device, scene_files
 from alpasim_plugin.lab.jobs import map_jobs
@@ -124,7 +124,7 @@ def pairs(
         console.print(f"{pack}: {packed}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         new = sum(bool(row["made"]) for row in rows)
-        print(json.dumps({"sequences": len(rows), "made": new, "rows": rows, "pack": packed}))
+        say_document({"sequences": len(rows), "made": new, "rows": rows, "pack": packed})
 
 
 @dataclass(frozen=True)

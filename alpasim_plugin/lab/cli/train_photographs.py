@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +9,7 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.drives.build import SCENARIO_FILE
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, Device
 from alpasim_plugin.lab.training.drive_pairs import make_drive_pairs
@@ -93,4 +93,4 @@ def photographs(
             soft_wrap=True,
         )
     if as_json:
-        print(json.dumps({"sequences": len(rows), "missing": list(missing), "rows": rows}))
+        say_document({"sequences": len(rows), "missing": list(missing), "rows": rows})

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug
 from alpasim_plugin.lab.training.frozen_scenes import RECORD, check_scenes
 from alpasim_plugin.lab.training.scenes import SPLITS, Split, write_scenes
@@ -53,7 +53,7 @@ def scenes(
         for name, digest in digests.items():
             console.print(f"{name}: {digest[:16]}, as frozen", highlight=False)
         if as_json:
-            print(json.dumps(digests))
+            say_document(digests)
         return
     recipe = SPLITS[split]
     paths = []
@@ -61,4 +61,4 @@ def scenes(
         paths.append(str(path))
         console.print(str(path), highlight=False, markup=False, soft_wrap=True)
     if as_json:
-        print(json.dumps({"split": split, "scenes": len(paths), "paths": paths}))
+        say_document({"split": split, "scenes": len(paths), "paths": paths})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.lab.training.model_card import curves
 from alpasim_plugin.lab.training.perceptual_term import Distance
 from alpasim_plugin.lab.training.recipes.recipe import Stage
@@ -170,4 +170,4 @@ class Progress:
             "hours": hours,
             "last": rows[-1],
         }
-        print(json.dumps(facts))
+        say_document(facts)
