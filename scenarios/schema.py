@@ -375,7 +375,7 @@ class ScenarioSpec(Part):
                 Tag("(list)"),
             ]
             | Annotated[CameraSet, Tag("(set)")],
-            Discriminator(lambda given: "(list)" if isinstance(given, list | tuple) else "(set)"),
+            Discriminator(lambda value: "(list)" if isinstance(value, list | tuple) else "(set)"),
         ]
         | None
     ) = field("None: the log's own, or one named front.", None)

@@ -232,7 +232,7 @@ class MapSpec(Part):
     )
     route: Annotated[
         Annotated[Literal["random"], Tag("(drawn)")] | Annotated[MapRoute, Tag("(named)")],
-        Discriminator(lambda given: "(drawn)" if isinstance(given, str) else "(named)"),
+        Discriminator(lambda value: "(drawn)" if isinstance(value, str) else "(named)"),
     ] = field("Where to drive; random: drawn by the scene seed.", "random")
     vehicles: int = number(0, 100, "Vehicles near the route, which react (IDM).", 6)
     pedestrians: int = number(0, 100, "Pedestrians on crosswalks of the route.", 2)
