@@ -1,14 +1,18 @@
 """What a name stands for, what a part declares, and what its digest sees."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
-from alpasim_plugin.core.parts import complete, names, resolve, resolve_renderer
+from alpasim_plugin.core.parts import build, complete, names, resolve, resolve_renderer
+from alpasim_plugin.core.parts.blame import is_own
 from alpasim_plugin.core.parts.source import code_digest, reached
 from alpasim_plugin.core.parts.spec import KINDS
+from evaluators.metrics.parts import PARTS
+from evaluators.metrics.presets import PRESETS
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -153,3 +157,11 @@ def test_settings_in_brackets_make_another_arm_of_one_fixer():
 def test_brackets_without_settings_are_refused(name):
     with pytest.raises(InputError, match="bracket"):
         resolve_renderer(name)
+
+
+def test_shipped_evaluators_are_known_as_simruns():
+    """They are functions with a preset bound to them; a user's function is none of simrun's."""
+    preset = PRESETS["strict"]
+    shipped = [build(resolve("evaluator", part.name), preset=preset) for part in PARTS]
+    assert all(is_own(evaluator) for evaluator in shipped)
+    assert not is_own(partial(len, preset))
