@@ -77,8 +77,14 @@ def fork(value):
 
 def start_process(value):
     context = multiprocessing.get_context("fork")
-    context.Process(target=time.sleep, args=(HOUR_S,), daemon=True).start()
+    context.Process(target=sleep_beside, args=(os.getpid(),), daemon=True).start()
     return value
+
+
+def sleep_beside(parent):
+    """Sleep as long as a parent lives: no test leaves processes."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
 
 
 def change_folder(value):

@@ -15,7 +15,7 @@ from tests.runs.bad_parts import FAULTS, HARMLESS
 
 FILE = Path(__file__).with_name("bad_parts.py")
 SHORT = ("--set", "timing.duration_us=900000", "--set", "timing.warmup_us=200000", "--no-report")
-LIMIT_S = 120
+LIMIT_S = 45
 QUICK = ("leave", "interrupt", "end_process", "crash", "close_files", "fork", "patch_library")
 CLASSES = {"policy": "policy", "renderer": "renderer fault", "fixer": "fixer fault"}
 HANGING = {"sleep", "spin"}
