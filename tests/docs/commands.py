@@ -18,13 +18,17 @@ NO_COMMAND = (
 NOT_RUN = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
     (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
-    (r"onefixer-2b|--device cuda", "needs weights of 4 GB, or a GPU"),
+    (r"onefixer-2b|--device cuda|doctor --gpu", "needs weights of 4 GB, or a GPU"),
     (
         r"^train |^bench |FILE|fixer\.weights\.bundle",
         "trains or measures for minutes to days, or needs what that made",
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
-    (r"^why ", "names a rollout of the reader's; tests/runs/test_why.py runs it"),
+    (
+        r"Town03\.xodr|mapping_example\.osm",
+        "drives on a map of the reader's; tests/scenarios/test_map_drive.py drives on both",
+    ),
+    (r"^why\b", "names a rollout of the reader's; tests/runs/test_why.py runs it"),
     (
         r"^serve|127\.0\.0\.1:|can://|scene\.usdz",
         "needs a service or a bus, or goes on until it is stopped: test_service_commands.py",

@@ -203,14 +203,14 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
     first = [one for one in run.rollouts if one.scene == scene][-1]  # of the last seed
     for one in run.rollouts:
         (run.folder / one.path / "rollout.asl").touch()
-    rollouts = []
+    every = []
     for one in run.rollouts:
-        if (one.scene, one.seed) == (scene, first.seed):
-            hit = float(one.renderer == "3dgs")
-            flags = {"collision_any": hit, "collision_at_fault": hit, "offroad": 0.0}
-            rollouts.append(dataclasses.replace(one, metrics={**one.metrics, **flags}))
+        hit = float((one.scene, one.seed, one.renderer) == (scene, first.seed, "3dgs"))
+        flags = {"collision_any": hit, "collision_at_fault": hit, "offroad": 0.0}
+        every.append(dataclasses.replace(one, metrics={**one.metrics, **flags}))
+    rollouts = [one for one in every if (one.scene, one.seed) == (scene, first.seed)]
     run = dataclasses.replace(
-        run, rollouts=tuple(rollouts), info=run.info | {"bases": {"onefixer": "3dgs"}}
+        run, rollouts=tuple(every), info=run.info | {"bases": {"onefixer": "3dgs"}}
     )
     for one in rollouts:
         (run.folder / one.path / "rollout.asl").touch()

@@ -45,6 +45,9 @@ ALIKE = {
         ("lateral_distance_m", "route_distance_m")
     ): "they part beyond the ends of the recorded path",
     frozenset(
+        ("min_distance_to_lane_boundary_m", "offroad_margin_m")
+    ): "they part off the road, where AlpaSim's name is zero",
+    frozenset(
         ("dist_traveled_m", "ego_x_m")
     ): "the recorded path leads east for most of this drive",
 }

@@ -279,11 +279,15 @@ def _focal_lengths(frame: Mapping[str, Any], width: int, height: int) -> tuple[f
 
     Raises:
         KeyError: Neither axis has one.
+        TypeError: One is no number.
     """
     lengths = {}
     for axis, size in (("x", width), ("y", height)):
         if f"fl_{axis}" in frame:
-            lengths[axis] = float(frame[f"fl_{axis}"])
+            focal_length = frame[f"fl_{axis}"]
+            if focal_length is None:
+                raise TypeError(f"the focal length fl_{axis} is null")
+            lengths[axis] = float(focal_length)
         elif f"camera_angle_{axis}" in frame:
             lengths[axis] = 0.5 * size / np.tan(0.5 * float(frame[f"camera_angle_{axis}"]))
         elif f"{axis}_fov" in frame:

@@ -23,7 +23,12 @@ from alpasim_plugin.lab.training.recipes.ablation import ABLATION
 from alpasim_plugin.lab.training.shared_rollout import Objectives
 from tests.block_fixers.fixer_cases import fixer, run_blocks, small_settings
 from tests.fixers.clip_cases import maps_of, moving_picture, pixels
-from tests.lab.training.generator_runs import brightness, clips_of, run_of
+from tests.lab.training.generator_runs import (
+    brightness,
+    clips_of,
+    data,  # noqa: F401 - data is a fixture
+    run_of,
+)
 
 
 def objectives_of(recipe):
