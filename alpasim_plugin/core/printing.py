@@ -32,9 +32,11 @@ def keep_stdout_for_document() -> None:
 
     Whatever else is written to it goes to standard error: by parts, by the processes that they
     start, and by libraries that know nothing of ``sys.stdout``. Nothing changes where standard
-    output is closed.
+    output is closed, or where a program that calls `main` has put a stream of its own in its place.
     """
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, AttributeError, ValueError):
+        if sys.stdout.fileno() != 1:
+            return
         document = os.dup(1)
         try:
             os.dup2(2, 1)

@@ -189,9 +189,9 @@ def _with_times(
     columns = []
     notes: list[str] = []
     for camera in cameras:
-        column, order_notes = in_order([each for each in photographs if each.camera == camera])
+        column, order_note = in_order([each for each in photographs if each.camera == camera])
         columns.append(column)
-        notes += order_notes
+        notes.append(order_note)
     return timed(columns), notes
 
 
