@@ -150,7 +150,8 @@ def test_import_form_makes_a_class_with_or_without_the_scenario():
     assert isinstance(make_policy(f"{__name__}:Bare", SCENARIO), Bare)
     made = make_policy(f"{__name__}:WithScenario", SCENARIO)
     assert isinstance(made, WithScenario)
-    assert made.scenario is SCENARIO
+    assert made.scenario.scene_id == SCENARIO.scene_id
+    assert not made.scenario.ego_log.xyz.flags.writeable  # the next policy sees the same scenario
 
 
 @pytest.mark.parametrize(

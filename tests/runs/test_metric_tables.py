@@ -108,7 +108,7 @@ def test_the_same_metric_in_other_words_can_be_compared_and_aggregated(places, c
     assert run_command(["compare", first, words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["paired"]["clean"]["height_m"]["diff"] == 0.0
     joined = aggregate_runs([Path(first), Path(words)])
-    assert joined["metrics"]["clean"]["height_m"]["mean"] == 1.5
+    assert joined.metrics["clean"]["height_m"].mean == 1.5
     assert read_run(first).table["height_m"].help == "height"
     assert read_run(words).table["height_m"].help == "height of the roof"
 
