@@ -159,10 +159,10 @@ class Culprit:
     is_at_work: bool
     since_s: float
 
-    def error(self, fate: str) -> SimrunError:
+    def error(self, ending: str) -> SimrunError:
         """Return the part's error for what became of its process."""
         return self.kind(
-            f"{self.name}: {fate}{self.called}",
+            f"{self.name}: {ending}{self.called}",
             "Correct the part: it may raise, but not end or leave its process.",
         )
 
