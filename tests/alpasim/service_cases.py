@@ -108,6 +108,7 @@ class StandInRenderer:
 
     def __init__(self):
         self.calls = []
+        self.lost_images = 0  # of an aggregated answer
         self.fault = None  # called with (request, context, image bytes); returns the bytes to send
 
     def get_version(self, asked, context):
@@ -169,9 +170,10 @@ class StandInRenderer:
 
     def render_aggregated(self, asked, context):
         """Draw frames, with bytes for the driver."""
+        self.calls.append("render_aggregated")
         rgb = [
             sensorsim_pb2.RGBRenderReturn(image_bytes=self._image(r, context))
-            for r in asked.rgb_requests
+            for r in asked.rgb_requests[self.lost_images :]
         ]
         return sensorsim_pb2.AggregatedRenderReturn(rgb_returns=rgb, driver_data=b"for the driver")
 

@@ -132,12 +132,28 @@ def test_a_batch_has_one_item_for_each_camera_with_success_set(
     assert renderer.calls == ["batch_render_rgb"] * 2  # handed on as a batch
 
 
-def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overrides):
-    frame = drive(1)[0]
+def test_aggregated_renders_are_fixed_and_keep_the_drivers_data(upstream, overrides, renderer):
+    frames = drive(2)
+    aggregated = sensorsim_pb2.AggregatedRenderRequest(rgb_requests=frames)
     with in_front_of(upstream, overrides=overrides) as (stub, _):
-        reply = stub.render_aggregated(sensorsim_pb2.AggregatedRenderRequest(rgb_requests=[frame]))
-        assert [r.image_bytes for r in reply.rgb_returns] == answers(stub, [frame])
+        reply = stub.render_aggregated(aggregated)
+        assert renderer.calls == ["render_aggregated"]  # every frame is drawn once
+        assert [r.image_bytes for r in reply.rgb_returns] == answers(stub, frames)
         assert reply.driver_data == b"for the driver"
+    with in_front_of(upstream, overrides=overrides) as (stub, _):
+        assert [r.image_bytes for r in reply.rgb_returns] == answers(stub, frames)
+
+
+def test_an_aggregated_answer_without_an_image_is_the_upstreams_fault(
+    upstream, overrides, renderer
+):
+    renderer.lost_images = 1
+    aggregated = sensorsim_pb2.AggregatedRenderRequest(rgb_requests=drive(2))
+    with (
+        in_front_of(upstream, overrides=overrides) as (stub, _),
+        pytest.raises(grpc.RpcError, match="1 images for 2"),
+    ):
+        stub.render_aggregated(aggregated)
 
 
 def test_frames_of_a_camera_in_one_call_follow_one_another_by_time(upstream, overrides):

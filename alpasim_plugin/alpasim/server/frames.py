@@ -66,12 +66,20 @@ class FrameServer:
         self._width = width
         self.events: Counter[str] = Counter()
 
-    def answers(self, requests: Sequence[Request], left: CallTime) -> list[bytes]:
+    def answers(
+        self, requests: Sequence[Request], left: CallTime, source: FrameSource | None = None
+    ) -> list[bytes]:
         """Return an encoded image for every request, in order. Equal requests get equal bytes.
+
+        Args:
+            requests: Of one call.
+            left: Of the caller.
+            source: Gives the frames in place of the server's own source.
 
         Raises:
             SimrunError, grpc.RpcError, Late: See `status.status_of`.
         """
+        source = source or self.source
         forms = [image_form(request) for request in requests]
         views = [read_view(request) for request in requests]
         pixels = sum(view.width * view.height for view in views)
@@ -86,7 +94,7 @@ class FrameServer:
                 scaled(view, self._width) if view.width > self._width else view for view in views
             ]
         if self._fixers is None:
-            rendered = self.source.render(requests, views, left)
+            rendered = source.render(requests, views, left)
             return [
                 encode(self._sized(item.frame.rgb, size), form)
                 for item, size, form in zip(rendered, sizes, forms, strict=True)
@@ -104,7 +112,7 @@ class FrameServer:
             by_time = sorted(missing.values(), key=lambda pair: pair[1].t_us)
             requests_in_time, views_in_time = zip(*by_time, strict=True)
             for item, view in zip(
-                self.source.render(requests_in_time, views_in_time, left),
+                source.render(requests_in_time, views_in_time, left),
                 views_in_time,
                 strict=True,
             ):

@@ -14,7 +14,7 @@ import numpy as np
 
 from alpasim_plugin.alpasim.server.caches import KEPT_SCENES, SceneCache, advertised
 from alpasim_plugin.alpasim.server.frames import FrameServer
-from alpasim_plugin.alpasim.server.sources import LocalSource
+from alpasim_plugin.alpasim.server.sources import LocalSource, ReceivedImages, UpstreamSource
 from alpasim_plugin.alpasim.server.status import CallTime, Failures, Unimplemented, answering
 from alpasim_plugin.alpasim.server.views import read_view
 from alpasim_plugin.core.errors import InputError
@@ -126,25 +126,22 @@ class Sensorsim(Failures):
         driver are handed on.
         """
         left = CallTime(context)
-        if self.upstream is None:
-            scans = [self._scan(one, left) for one in request.lidar_requests]
+        requests = list(request.rgb_requests)
+        source = self.frames.source
+        if not isinstance(source, UpstreamSource):
+            scans = [self._scan(scan_request, left) for scan_request in request.lidar_requests]
+            images = self.frames.answers(requests, left)
             return sensorsim_pb2.AggregatedRenderReturn(
-                rgb_returns=self._returns(request, left), lidar_returns=scans
+                rgb_returns=_returns(images), lidar_returns=scans
             )
-        reply: sensorsim_pb2.AggregatedRenderReturn
-        reply = self.forward("render_aggregated", request, context)
-        if request.rgb_requests:
-            del reply.rgb_returns[:]
-            reply.rgb_returns.extend(self._returns(request, left))
+        keys = [read_view(frame_request).key for frame_request in requests]
+        reply = source.render_aggregated(request, left)
+        received = [item.image_bytes for item in reply.rgb_returns]
+        images_by_key = dict(zip(keys, received, strict=True))
+        images = self.frames.answers(requests, left, ReceivedImages(source, images_by_key))
+        del reply.rgb_returns[:]
+        reply.rgb_returns.extend(_returns(images))
         return reply
-
-    def _returns(
-        self, request: sensorsim_pb2.AggregatedRenderRequest, left: CallTime
-    ) -> list[sensorsim_pb2.RGBRenderReturn]:
-        return [
-            sensorsim_pb2.RGBRenderReturn(image_bytes=i)
-            for i in self.frames.answers(list(request.rgb_requests), left)
-        ]
 
     @answering
     @forwarded
@@ -279,6 +276,10 @@ class Sensorsim(Failures):
     def _own_scenes(self) -> SceneCache:
         assert self._scenes is not None, "a server without an upstream has scenes"
         return self._scenes
+
+
+def _returns(images: Sequence[bytes]) -> list[sensorsim_pb2.RGBRenderReturn]:
+    return [sensorsim_pb2.RGBRenderReturn(image_bytes=image) for image in images]
 
 
 @dataclass(frozen=True)

@@ -324,9 +324,32 @@ class UpstreamSource:
         )
         images = self._images([self._asked(request) for request in requests], names, left)
         return [
-            self._rendered(request, view, data, left)
+            self.rendered(request, view, data, left)
             for request, view, data in zip(requests, views, images, strict=True)
         ]
+
+    def render_aggregated(
+        self, request: sensorsim_pb2.AggregatedRenderRequest, left: CallTime
+    ) -> sensorsim_pb2.AggregatedRenderReturn:
+        """Return the upstream's answer to a call for frames, lidar spins and its data for the
+        driver; its images are those of `ReceivedImages`.
+
+        Raises:
+            grpc.RpcError: The upstream failed.
+            UpstreamFault: It sent another number of images.
+        """
+        upstream_request = sensorsim_pb2.AggregatedRenderRequest()
+        upstream_request.CopyFrom(request)  # fields of newer versions are kept
+        del upstream_request.rgb_requests[:]
+        upstream_request.rgb_requests.extend(self._asked(frame) for frame in request.rgb_requests)
+        reply: sensorsim_pb2.AggregatedRenderReturn
+        reply = self._stub.render_aggregated(upstream_request, timeout=left.left_s())
+        if len(reply.rgb_returns) != len(request.rgb_requests):
+            raise UpstreamFault(
+                f"the upstream's aggregated answer: {len(reply.rgb_returns)} images for {len(request.rgb_requests)}",
+                "see the upstream's log",
+            )
+        return reply
 
     def _asked(self, request: Request) -> Request:
         if not self._as_png:
@@ -357,7 +380,10 @@ class UpstreamSource:
             for request in requests
         ]
 
-    def _rendered(self, request: Request, view: View, data: bytes, left: CallTime) -> Rendered:
+    def rendered(self, request: Request, view: View, data: bytes, left: CallTime) -> Rendered:
+        """Return the frame of an encoded image that the upstream sent for a request; see
+        `render`.
+        """
         rgb = decoded(data, f"scene {view.scene_id!r}, camera {view.camera!r} at {view.t_us} us")
         height, width = rgb.shape[:2]
         alpha = trusted_opacity(
@@ -424,6 +450,28 @@ class UpstreamSource:
             # a camera of the runtime's own: its place counts instead of the rig's
             self._mounts.setdefault(key, np.eye(4))
         return self._mounts[key]
+
+
+@dataclass(frozen=True)
+class ReceivedImages:
+    """Give the frames of images that an upstream has sent already.
+
+    Attributes:
+        source: Of the upstream.
+        images: Encoded, by the key of their view.
+    """
+
+    source: UpstreamSource
+    images: Mapping[bytes, bytes]
+
+    def render(
+        self, requests: Sequence[Request], views: Sequence[View], left: CallTime
+    ) -> list[Rendered]:
+        """Return one frame a request, in order; see `UpstreamSource.render`."""
+        return [
+            self.source.rendered(request, view, self.images[view.key], left)
+            for request, view in zip(requests, views, strict=True)
+        ]
 
 
 def forget_if_many(values_by_name: dict[Any, Any]) -> None:
