@@ -17,8 +17,11 @@ from alpasim_plugin.alpasim.server.driver_service import DriverService
 from alpasim_plugin.alpasim.server.hosting import Host
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError, PolicyError, RendererError
+from alpasim_plugin.core.geometry import se2, trajectory_from_poses
 from alpasim_plugin.core.parts import build, resolve
+from alpasim_plugin.core.types import EgoState, Observation
 from alpasim_plugin.log import decode_image
+from alpasim_plugin.log.schema import wire_trajectory
 from alpasim_plugin.log.wire import (
     FRONT_WIDE,
     SERVICE_PATHS,
@@ -197,6 +200,27 @@ def test_the_first_motion_is_the_whole_context_with_its_speeds(scenario):
     (camera,) = own.sessions[0].rollout_spec.vehicle.available_cameras
     assert camera.logical_id == camera.intrinsics.logical_id == FRONT_WIDE
     assert own.sessions[0].debug_info.scene_id == scenario.scene_id
+
+
+def test_the_yaw_rate_of_a_motion_through_180_degrees_is_that_of_its_turn(scenario):
+    seconds = np.arange(21) * 0.1
+    heading = np.radians(170.0) + 0.2 * seconds
+    poses = [se2(-5.0 * t, 0.5 * t**2, yaw) for t, yaw in zip(seconds, heading, strict=True)]
+    t_us = scenario.start_us + np.rint(seconds * 1e6).astype(np.int64)
+    motion = trajectory_from_poses(t_us, poses)
+    scripted = Scripted(
+        egodriver_pb2.DriveResponse(trajectory=wire_trajectory(motion, "a plan in the world"))
+    )
+    server, address = serve("EgodriverService", scripted)
+    policy = build(resolve("policy", f"alpasim://{address}"), scenario=scenario)
+    policy.reset(0, scenario.route)
+    ego = EgoState(int(t_us[-1]), poses[-1], 5.0, yaw_rate_radps=0.2)
+    policy.act(Observation(ego.t_us, {}, {}, ego, motion, np.zeros((20, 3))))
+    policy.close()
+    server.stop(0)
+    (request,) = scripted.motion
+    rates = [state.angular_velocity.z for state in request.dynamic_states]
+    assert_allclose(rates, 0.2, atol=1e-4)
 
 
 def test_an_end_of_session_and_a_missing_service_are_said(scenario):

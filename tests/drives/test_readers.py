@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.source import checked
@@ -57,6 +58,25 @@ def test_the_facts_of_a_real_street(data_set):
     assert (len(drive.of("left")), len(drive.of("right"))) == (51, 51)
     across = np.linalg.inv(drive.of("left")[9].T_world_camera) @ drive.of("right")[9].T_world_camera
     assert across[:3, 3] == pytest.approx([0.5372, 0.0, 0.0], abs=1e-4)
+
+
+def test_the_second_camera_of_a_turned_rig_stays_at_its_side(tmp_path):
+    folder = tmp_path / "street"
+    for name in ("image_l", "image_r"):
+        (folder / name).mkdir(parents=True)
+        for i in range(2):
+            cv2.imwrite(str(folder / name / f"{i:06d}.png"), np.zeros((4, 8), np.uint8))
+    turns = Rotation.from_euler("yxz", [(100, 4, -7), (120, -3, 5)], degrees=True).as_matrix()
+    poses = np.concatenate([turns, [[[5.0], [0.0], [9.0]], [[6.0], [0.1], [9.5]]]], axis=2)
+    np.savetxt(folder / "poses.txt", poses.reshape(2, 12))
+    left = np.array([[10.0, 0, 4, 0], [0, 10, 2, 0], [0, 0, 1, 0]])
+    right = left.copy()
+    right[0, 3] = -10 * 0.54
+    np.savetxt(folder / "calib.txt", [left.ravel(), right.ravel()])
+    drive = read_source(folder)
+    for left, right in zip(drive.of("left"), drive.of("right"), strict=True):
+        T_left_right = np.linalg.inv(left.T_world_camera) @ right.T_world_camera
+        assert T_left_right[:3, 3] == pytest.approx([0.54, 0.0, 0.0], abs=1e-6)
 
 
 def test_times_put_photographs_in_order(tmp_path):

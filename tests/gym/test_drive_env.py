@@ -3,6 +3,7 @@ how episodes end.
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import se2, se3
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import Plan
+from alpasim_plugin.core.types import EgoState, Plan
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.recorder import Recorder
@@ -19,12 +21,14 @@ from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
 from evaluators import score
 from policies.base import make_policy
+from scenarios.load import load_scenario
 
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 import alpasim_plugin.gym as doors  # noqa: E402
 from alpasim_plugin.gym.env import DriveEnv, HeldCommand  # noqa: E402
+from alpasim_plugin.gym.reward import Reward, Scorer  # noqa: E402
 
 SMALL = "cameras=[{width: 64, height: 36}]"
 SHORT = ("timing.duration_us=1500000", "timing.warmup_us=300000")
@@ -154,6 +158,19 @@ def test_the_reward_is_that_of_the_evaluators_and_leaving_the_road_ends_the_epis
     with pytest.raises(InputError, match=r"call reset\(\) first"):
         env.step(STRAIGHT_ON)
     env.close()
+
+
+def test_an_instant_off_the_road_counts_in_the_step_that_it_ends_only():
+    scenario = load_scenario("smoke/curve")
+    log = scenario.ego_log
+    poses = se3(log.xyz, log.quat)
+    start, later = (EgoState(int(log.t_us[i]), poses[i], 5.0) for i in (0, len(poses) // 2))
+    aside = replace(start, T_world_rig=start.T_world_rig @ se2(0.0, 6.0, 0.0))
+    scorer = Scorer(scenario, "paper", Reward())
+    _, ended, _ = scorer.score([(aside, {})])
+    assert ended == "offroad"
+    _, ended, _ = scorer.score([(later, {})])
+    assert ended == ""
 
 
 @pytest.mark.slow

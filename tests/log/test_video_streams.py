@@ -2,6 +2,7 @@
 damaged, without pictures.
 """
 
+import struct
 from fractions import Fraction
 
 import av
@@ -75,6 +76,28 @@ def test_pixel_aspect_is_kept(tmp_path):
         video.write(picture(), 0)
     with VideoReader(tmp_path / "a.mp4") as back:
         assert back.format.pixel_aspect == Fraction(4, 3)
+
+
+def turn(path, quarter):
+    """Write into the header of an mp4 that its track is shown turned."""
+    data = bytearray(path.read_bytes())
+    upright = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    turned = struct.pack(">9i", 0, quarter << 16, 0, -quarter << 16, 0, 0, 0, 0, 1 << 30)
+    # The first matrix is the film's, the second the track's.
+    track = data.index(upright, data.index(b"tkhd"))
+    data[track : track + len(turned)] = turned
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("quarter", [1, -1])
+def test_the_pixels_of_a_turned_video_are_as_wide_as_they_were_high(tmp_path, quarter):
+    path = tmp_path / "a.mp4"
+    with VideoWriter(path, Fraction(1, 10), Fraction(10), pixel_aspect=Fraction(4, 3)) as video:
+        video.write(picture(height=32, width=48), 0)
+    turn(path, quarter)
+    with VideoReader(path) as back:
+        assert (back.format.width, back.format.height) == (32, 48)
+        assert back.format.pixel_aspect == Fraction(3, 4)
 
 
 def cut_short(folder):

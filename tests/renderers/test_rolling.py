@@ -129,6 +129,25 @@ def test_shutters_that_roll_another_way_do_so_on_the_cpu_too(scenario, draw, alo
     assert psnr(*draw_requests([request], draw, "cpu"), truth) > 32
 
 
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("along", ["rows", "columns"])
+def test_a_pixel_is_drawn_at_the_time_of_its_row_or_column(scenario, along, backwards):
+    request = case(with_camera(scenario, 12, 5), **HARD["all"])
+    assert request.exposure is not None
+    share = rolling(12, 5, along, backwards)
+    views = []
+    draw_requests(
+        [replace(request, exposure=replace(request.exposure, share=share))],
+        lambda asked: views.extend(asked) or scene_of(scenario).render_all(asked, 1),
+        "cpu",
+    )
+    ((camera, _),) = views
+    per_column, per_row, offset = camera.rolling.time
+    columns, rows = np.meshgrid(np.arange(12) + 0.5, np.arange(5) + 0.5)
+    times = per_column * columns + per_row * rows + offset
+    np.testing.assert_allclose(times, np.broadcast_to(share - 0.5, (5, 12)), atol=1e-6)
+
+
 def test_the_error_falls_as_bands_grow_in_number_and_ends_at_rounding(
     scenario,
     draw,

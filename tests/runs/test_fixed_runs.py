@@ -13,8 +13,6 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.runs.cell import MANIFEST
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
-from alpasim_plugin.runs.summary import speed
-from evaluators.results import StageSpeed
 from scenarios.suite import expand
 from tests.runs.short_runs import Announced, comparable
 
@@ -123,22 +121,3 @@ def test_hits_and_pose_errors_are_in_the_tables(finished):
     assert len(shown) == entry["frames"]
     assert max(shown) <= 0.02
     assert max(shown) == pytest.approx(entry["shown_error"]["camera_m"])
-
-
-def test_time_is_counted_where_it_was_spent():
-    draft = {"render": [9.0, 6.0, 2.0, 2.0, 6.0, 2.0], "fix": [30.0, 12.0, 0.0, 0.0, 12.0, 0.0]}
-    told = speed([{"frames": 6, "first_call_frames": 1, "stage_ms": draft}])
-    assert told.first_frame_ms == 39.0
-    assert told.ms_per_frame_p50 == 2.0
-    assert told.ms_per_frame_mean == pytest.approx(42.0 / 5)
-    assert told.stages["fix"] == StageSpeed(
-        p50_ms=12.0, p95_ms=12.0, share=round(24 / 42, 4), per_frame_ms=4.8
-    )
-
-
-def test_the_frames_of_a_block_share_its_time_and_the_first_block_stands_apart():
-    blocks = {"render": [100.0] * 5 + [3.0] * 8, "policy": [50.0, 8.0]}
-    told = speed([{"frames": 13, "first_call_frames": 5, "stage_ms": blocks}])
-    assert told.stages["render"].p50_ms == 3.0
-    assert told.stages["render"].per_frame_ms == 3.0
-    assert told.stages["policy"].p50_ms == 8.0
