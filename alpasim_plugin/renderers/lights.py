@@ -124,8 +124,9 @@ class SceneLights:
         if not self.is_night:
             return spots
         spots += [Spot(tip, np.zeros(3), 0.25, STREET_RGB) for tip in self.tips]
-        for name in self.boxes.keys() & actors.keys():
-            box = self.boxes[name]
+        for name, box in self.boxes.items():
+            if name not in actors:
+                continue
             T = actors[name]
             for end, rgb in ((1, HEAD_RGB), (-1, TAIL_RGB)):
                 middle = _moved(T, end * box.length_m / 2, LAMP_HEIGHT_M - box.height_m / 2)[:3, 3]
@@ -158,7 +159,7 @@ def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
     offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - view.place
     local = offsets @ view.T_world_camera[:3, :3]
     distance = np.linalg.norm(offsets, axis=1)
-    for i in np.argsort(-distance):
+    for i in np.argsort(-distance, kind="stable"):
         spot = spots[i]
         depth = float(local[i, 2])
         facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0

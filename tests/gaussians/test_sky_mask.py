@@ -77,6 +77,16 @@ def test_another_camera_of_the_rig_completes_what_the_own_one_did_not_see():
     assert share[9, 22:].min() == 1.0
 
 
+def test_many_views_of_the_own_camera_leave_room_for_the_one_that_saw_the_rest():
+    """Of a drive a camera has a view every second, and all of them lack what lies to the side."""
+    clear = np.zeros((18, 32), np.float32)
+    fronts = [view(clear, "front", x_m=float(x)) for x in range(20)]
+    mask = SkyMask([*fronts, view(clear, "left", yaw_rad=0.5)])
+    turned = camera(32, 18, x_m=5.0, yaw_rad=0.3)
+    assert SkyMask(fronts).share(turned, "front")[9, :6].max() == 0.0
+    assert mask.share(turned, "front").min() == 1.0
+
+
 def test_a_camera_without_a_view_of_its_name_takes_the_nearest_that_shows_its_image():
     clear = np.zeros((18, 32), np.float32)
     hidden = np.ones((18, 32), np.float32)

@@ -226,6 +226,22 @@ def test_a_street_lamp_lights_by_cosine_over_the_square_of_the_distance():
     assert not lux[:30].any()
 
 
+def test_lamps_of_road_users_come_in_the_order_of_the_scene_in_every_process():
+    """The order of a set of names changes with the process; where lamps overlap it decides."""
+    base, present = car(1.0)
+    cars = tuple(replace(base, actor_id=f"car-{i}") for i in range(20))
+    poses = {}
+    for i, actor in enumerate(cars):
+        pose = present["car"].copy()
+        pose[0, 3] += 10.0 * i
+        poses[actor.actor_id] = pose
+    lamps = SceneLights(scene("time=night", "poles_spacing_m=0", "buildings=0", actors=cars))
+    backwards = dict(reversed(poses.items()))
+    spots = lamps.spots(backwards, 0)[-4 * len(cars) :]
+    places = [spot.middle[0] for spot in spots]
+    assert places == sorted(places, key=lambda x: (x - 10) // 10)
+
+
 def test_night_is_dark_but_for_the_beams_of_the_ego():
     scenario = scene("time=night", "poles_spacing_m=0", "buildings=0")
     road = shown(scenario, depth_of_road()).astype(float).mean(axis=2)

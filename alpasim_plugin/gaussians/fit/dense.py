@@ -30,6 +30,7 @@ from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
 
 GAPS = (-3, -2, -1, 1, 2, 3)
+SQUARE_PX = 4  # depth is interpolated between points at about every such pixel
 STRIDE = 2  # every such pixel is measured, in rows and columns
 RESIDUAL_PX = 0.7  # between flow and what the depth predicts
 LEAST_SUPPORT = 3  # neighbours that agree; two at the ends of the way
@@ -88,7 +89,13 @@ def between_points(camera: PinholeCamera, tracks: Tracks, placed: Placed, i: int
         return None
     pixels = tracks.pixel[rows][good]
     q = 1 / local[good]
-    v, u = np.mgrid[0 : camera.height : 4, 0 : camera.width : 4] + 0.5
+    # At the middles of the squares for which the enlarging takes them.
+    columns = -(-camera.width // SQUARE_PX)
+    rows_of_squares = -(-camera.height // SQUARE_PX)
+    u, v = np.meshgrid(
+        (np.arange(columns) + 0.5) * (camera.width / columns),
+        (np.arange(rows_of_squares) + 0.5) * (camera.height / rows_of_squares),
+    )
     inside = scipy.interpolate.LinearNDInterpolator(pixels, q)(u, v)
     outside = scipy.interpolate.NearestNDInterpolator(pixels, q)(u, v)
     coarse = np.where(np.isnan(inside), outside, inside).astype(np.float32)

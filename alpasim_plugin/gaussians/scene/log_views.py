@@ -42,17 +42,18 @@ class SkyView:
 
 
 # Of a view that others are asked to complete: the share of the image that it must show. How many
-# views complete it, and how many directions along each side of the image say what a view shows.
+# views answer, and how many directions along each side of the image say what a view shows.
 LEAST_COVER = 0.5
 MOST_VIEWS = 8
-DIRECTIONS = 5
+DIRECTIONS = 9
 
 
 class SkyMask:
     """Sky mask from what the log's views saw of the directions of a camera.
 
     The nearest view of the same camera comes first, then those of others; a view answers for the
-    directions that it saw, and the next for what is left. A direction that none saw is no sky.
+    directions that it saw, and the next that saw any of what is left for those. A direction that
+    none saw is no sky.
 
     Args:
         views: Of cameras that may look in different directions; without any, nothing is sky.
@@ -88,17 +89,28 @@ class SkyMask:
 
     def _in_order(self, camera: PinholeCamera, name: str) -> list[int]:
         """Return the numbers of the views that show any of an image, the first to be asked first:
-        those that show enough of it, of its own camera and near; then those that show more.
+        those that show directions which the ones before them do not, then the others.
+
+        Both are in one order: views that show enough of the image, of its own camera and near; then
+        those that show more. Without the first rule the own camera's many views of the same
+        directions would leave no room for the one camera that saw the rest.
         """
-        cover = self._cover(camera)
+        shows = self._shown_directions(camera)
+        cover = shows.mean(axis=1)
         away_m = np.linalg.norm(self._eyes - camera.centre_world, axis=1)
         is_other = self._names != name if name in self._names else np.zeros(len(cover), np.bool_)
         lacking = np.where(cover < LEAST_COVER, 1 - cover, 0.0)
-        order = np.lexsort((away_m, is_other, lacking))
-        return [int(i) for i in order if cover[i] > 0]
+        order = [int(i) for i in np.lexsort((away_m, is_other, lacking)) if cover[i] > 0]
+        is_open = np.ones(shows.shape[1], np.bool_)
+        completing = []
+        for i in order:
+            if (shows[i] & is_open).any():
+                completing.append(i)
+                is_open &= ~shows[i]
+        return [*completing, *(i for i in order if i not in completing)]
 
-    def _cover(self, camera: PinholeCamera) -> F64:
-        """Return what share of an image's directions lies in each view, ``(V,)``."""
+    def _shown_directions(self, camera: PinholeCamera) -> Bool:
+        """Return which of an image's directions lie in each view, ``(V, N)``."""
         x, y = np.meshgrid(
             np.linspace(0, camera.width, DIRECTIONS), np.linspace(0, camera.height, DIRECTIONS)
         )
@@ -109,7 +121,7 @@ class SkyMask:
         places = projected[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
         # A camera turned by rounding alone sees its own border.
         inside = (places > -1e-6) & (places < self._sizes[..., None] + 1e-6)
-        return np.asarray((inside.all(axis=1) & (depth > 0)).mean(axis=1), np.float64)
+        return np.asarray(inside.all(axis=1) & (depth > 0), np.bool_)
 
 
 def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.geometry import intrinsics
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_near
-from alpasim_plugin.gaussians.fit.tracks import Tracks, corrected, follow, place
+from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
 from alpasim_plugin.gaussians.fit.views import halved
 from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
 
@@ -97,6 +99,29 @@ def test_nothing_is_measured_where_tracks_place_too_few_points(views):
     empty = place(none, [view.camera for view in views])
     assert between_points(views[0].camera, none, empty, 0) is None
     assert not any(depth.any() for depth in depth_maps(views[:3], none, empty))
+
+
+def test_inverse_depth_between_points_of_a_plane_is_the_plane_s_at_the_middle_of_every_pixel():
+    """On a plane it is linear in the image, so interpolating it errs by rounding alone."""
+    width = 101
+    height = 62
+    camera = PinholeCamera(width, height, intrinsics(80.0, 80.0, 50.0, 30.0), np.eye(4))
+    x, y = np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 7))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def inverse_depth(pixel):
+        return 0.1 + 0.0005 * pixel[..., 0] + 0.0007 * pixel[..., 1]
+
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T
+    points = np.arange(len(pixels))
+    tracks = Tracks(np.zeros_like(points), points, pixels, len(points))
+    xyz = rays / inverse_depth(pixels)[:, None]
+    known = Placed(xyz, np.zeros(len(points)), np.ones(len(points)))
+    measured = between_points(camera, tracks, known, 0)
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    true = inverse_depth(np.stack([columns, rows], axis=-1))
+    inner = slice(4, -4), slice(4, -4)
+    np.testing.assert_allclose(measured[inner], true[inner], rtol=2e-5)
 
 
 def test_sky_is_found_where_the_street_has_none_of_its_own(views):
