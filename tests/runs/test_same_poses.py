@@ -4,6 +4,7 @@ from alpasim_plugin.core.files import read_json
 from alpasim_plugin.log.run_folder.schema import SAME_POSES
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
+from evaluators.metrics.outcomes import first_failure
 from scenarios.suite import expand
 from tests.runs.grey_policy import BY_GREY
 from tests.runs.grey_renderer import GREY
@@ -17,10 +18,16 @@ def test_images_of_the_other_renderer_are_stored_beside_a_failure(tmp_path):
     refs = expand("smoke/straight", ("timing.duration_us=4000000",))
     plan = make_plan(refs, (GREY, DARKER), (BY_GREY,), (0,), RunOptions())
     root = tmp_path / "run"
-    execute_run(plan, root, 1, ["simrun"], Announced(), report=False)
-    files = sorted(root.glob(f"rollouts/**/{SAME_POSES}"))
-    assert files
-    for file in files:
-        content = read_json(file)
-        assert content["key"]
-        assert [len(images) > 0 for images in content["images"].values()] == [True]
+    announced = Announced()
+    execute_run(plan, root, 1, ["simrun"], announced, report=False)
+    manifests = [read_json(root / cell.folder / "manifest.json") for cell in plan.cells]
+    errors = [manifest.get("error") for manifest in manifests]
+    assert errors == [None, None], announced.notices
+    is_failure = [first_failure(manifest) is not None for manifest in manifests]
+    assert is_failure == [False, True], [manifest["events"] for manifest in manifests]
+    (file,) = root.glob(f"rollouts/**/{SAME_POSES}")
+    assert file.parent == root / plan.cells[1].folder
+    content = read_json(file)
+    assert content["key"]
+    assert [*content["images"]] == [GREY]
+    assert len(content["images"][GREY]) > 0
