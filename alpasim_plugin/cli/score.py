@@ -83,6 +83,7 @@ def score(
                 out if out is None or len(names) == 1 else out / name,
                 ["simrun", *sys.argv[1:]],
                 lambda manifest: progress.rollout_done(manifest, reused=False),
+                progress.noticed,
             )
     code = worst_code([result.exit_code for result in results.values()])
     documents = {name: result.as_dict() for name, result in results.items()}

@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -27,11 +27,11 @@ from alpasim_plugin.core.errors import (
 )
 from alpasim_plugin.core.files import content_of, places, real, some_of
 from alpasim_plugin.core.files.atomic import disk_error
-from alpasim_plugin.core.files.inputs import Inputs
+from alpasim_plugin.core.files.inputs import ABSENT, Inputs
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.parts import RendererSpec, build, complete
+from alpasim_plugin.core.parts import PartSpec, RendererSpec, build, complete
 from alpasim_plugin.core.parts.blame import last_called
 from alpasim_plugin.core.parts.patches import replaced_code
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
@@ -48,10 +48,12 @@ from alpasim_plugin.log.run_folder.schema import (
     DERIVED,
     DRIVEN,
     FRAMES_NAME,
+    INPUTS,
     LOG_NAME,
     MANIFEST,
     OUTPUT_NAME,
     SAME_POSES,
+    SCORE_INPUTS,
     VIDEO_NAME,
     WHY_NAME,
 )
@@ -153,9 +155,9 @@ def run_cell(
             announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
         require_same_code()
-        manifest["inputs"] = _not_planned(inputs, cell, scenario, root)
+        manifest[INPUTS] = _not_planned(inputs, _parts_of_drive(cell), scenario, root)
         manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
-        manifest |= _score(folder, cell, options, scenario)
+        manifest |= _score(root, cell, options, scenario)
         require_same_code()
         if _wants_film(options.video, manifest):
             recorder.film.save(folder)
@@ -164,24 +166,31 @@ def run_cell(
     return manifest
 
 
-def _not_planned(inputs: Inputs, cell: Cell, scenario: Scenario, root: Path) -> dict[str, str]:
-    """Return what a rollout read that its key does not hold, by path: a later command reuses the
-    rollout only while these files are as they were.
+def _parts_of_drive(cell: Cell) -> list[PartSpec]:
+    """Return the parts that drive a rollout."""
+    parts = (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller)
+    return [part for part in parts if part is not None]
 
-    What lies in the cache is named by its content, and what the rollout itself wrote or removed is
-    no input.
+
+def _not_planned(
+    inputs: Inputs, parts: Sequence[PartSpec], scenario: Scenario, root: Path
+) -> dict[str, str]:
+    """Return what parts read that no key holds, by path: a later command reuses what they made only
+    while these files are as they were.
+
+    What lies in the cache or in the run folder is no input, nor is a file that was removed since: a
+    temporary one. A file that was edited since counts as it was read.
     """
     held = {*scenario.files}
-    for part in (cell.renderer.base, cell.renderer.fixer, cell.policy, cell.controller):
-        if part is not None:
-            held |= {str(real(path)) for path in (*part.files, *part.code)}
+    for part in parts:
+        held |= {str(real(path)) for path in (*part.files, *part.code)}
     written = [real(root), real(places.cache())]
     return {
         path: content
         for path, content in inputs.files.items()
         if path not in held
         and not any(Path(path).is_relative_to(folder) for folder in written)
-        and content_of(path) == content
+        and (content == ABSENT or content_of(path) != ABSENT)
     }
 
 
@@ -401,13 +410,12 @@ def failed_manifest(cell: Cell, error: SimrunError) -> JsonObject:
 
 
 def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: JsonObject) -> JsonObject:
-    """Score a finished rollout again from its log: another preset, changed evaluators, or a damaged
-    table; return the new manifest.
+    """Score a finished rollout again from its log: another preset, changed evaluators or a file that
+    one of them read, or a damaged table; return the new manifest.
     """
-    folder = root / cell.folder
-    manifest = manifest | _score(folder, cell, options, _scenario(cell))
+    manifest = manifest | _score(root, cell, options, _scenario(cell))
     manifest |= {"score_key": cell.score_key, "preset": options.preset}
-    write_manifest(folder, manifest)
+    write_manifest(root / cell.folder, manifest)
     return manifest
 
 
@@ -420,7 +428,7 @@ def find_rollout_state(
     """Return what a cell needs, and the rollout as it is found on disk.
 
     A rollout with another content key is driven again; so is one that read a file beside it which is
-    another one now, one with a part that has no digest unless ``reuse_undigested`` is set, and a
+    another one now (an evaluator's file: scored again), one with a part that has no digest unless ``reuse_undigested`` is set, and a
     failed one, except where the code of a part alone is at fault: the same code would fail again.
     What a remote part did wrong is never kept. One that was driven without the
     ``video`` that is asked for now is driven again as well.
@@ -445,9 +453,16 @@ def find_rollout_state(
     is_filmed = VIDEO_NAME in manifest["files"] or manifest.get("video") == video
     if _wants_film(video, manifest) and not is_filmed:
         return "drive", state
-    if state.action == "none" and manifest.get("score_key") != cell.score_key:
+    if state.action == "none" and not _is_scored_so(cell, manifest, reuse_undigested):
         return "score", state
     return state.action, state
+
+
+def _is_scored_so(cell: Cell, manifest: JsonView, reuse_undigested: bool) -> bool:
+    """Tell whether the scores of a rollout are those that its cell asks for."""
+    if manifest.get("score_key") != cell.score_key or changed_inputs(manifest, SCORE_INPUTS):
+        return False
+    return reuse_undigested or all(part.digest is not None for part in cell.evaluators)
 
 
 def kept_failure(cell: Cell, manifest: JsonView) -> str:
@@ -461,12 +476,15 @@ def kept_failure(cell: Cell, manifest: JsonView) -> str:
     )
 
 
-def _score(folder: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> JsonObject:
-    rows, facts = score_log(
-        folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
-    )
+def _score(root: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> JsonObject:
+    """Score a log, write its steps, and return what the manifest says of its scores."""
+    folder = root / cell.folder
+    with Inputs() as inputs:
+        rows, facts = score_log(
+            folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
+        )
     write_steps(folder, [cell.names | row for row in rows])
-    return facts
+    return facts | {SCORE_INPUTS: _not_planned(inputs, cell.evaluators, scenario, root)}
 
 
 @contextmanager

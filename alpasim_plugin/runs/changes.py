@@ -1,5 +1,5 @@
-"""Why a rollout that was driven before is driven again: what of its making is another one now, by
-name.
+"""Why a rollout that was driven before is driven or scored again: what of its making is another one
+now, by name.
 """
 
 from collections.abc import Mapping, Sequence
@@ -7,17 +7,23 @@ from collections.abc import Mapping, Sequence
 from alpasim_plugin.core.files import content_of, some_of
 from alpasim_plugin.core.files.inputs import ABSENT
 from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.log.run_folder.schema import INPUTS, SCORE_INPUTS
 from alpasim_plugin.runs.plan import SIMRUN, Cell, RunPlan
 
 OLDER = "it was driven by another version of simrun"
 SHOWN_FILES = 3
 
 
-def changed_inputs(manifest: JsonView) -> dict[str, str]:
-    """Return the files that a rollout read beside what its key holds and that are others now: the
-    content at present by path.
+def changed_inputs(manifest: JsonView, member: str = INPUTS) -> dict[str, str]:
+    """Return the files that a rollout, or its scoring, read beside what its key holds and that are
+    others now: the content at present by path.
+
+    Args:
+        manifest: Of the rollout.
+        member: `INPUTS` or `SCORE_INPUTS`.
     """
-    before: Mapping[str, str] = manifest.get("inputs") or {}
+    before: Mapping[str, str] = manifest.get(member) or {}
     now = {path: content_of(path) for path in before}
     return {path: content for path, content in now.items() if content != before[path]}
 
@@ -32,7 +38,7 @@ def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> li
         held: ``run.json`` of that time; empty where it is not known.
         plan: The run.
     """
-    changed = _file_changes(manifest.get("inputs") or {}, changed_inputs(manifest))
+    changed = _file_changes(manifest.get(INPUTS) or {}, changed_inputs(manifest))
     before: Mapping[str, str | None] | None = manifest.get("made_of")
     if before is None:
         return [OLDER]
@@ -47,11 +53,42 @@ def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> li
     return changed
 
 
-def sentence(count: int, all_reasons: Sequence[str]) -> str:
-    """Say how many rollouts are driven again, and why."""
+def score_reasons(manifest: JsonView, held: JsonView, plan: RunPlan) -> list[str]:
+    """Say why a rollout is scored again whose files are whole: the arguments are those of `reasons`."""
+    changed = _file_changes(
+        manifest.get(SCORE_INPUTS) or {}, changed_inputs(manifest, SCORE_INPUTS)
+    )
+    if manifest.get("preset") != plan.options.preset:
+        changed.append(f"the preset was {manifest.get('preset')}")
+    stated: JsonView = held.get("parts") or {}
+    evaluators = [part for part in plan.parts if part.kind == "evaluator"]
+    return changed + changed_evaluators(stated, evaluators)
+
+
+def changed_evaluators(stated: JsonView, evaluators: Sequence[PartSpec]) -> list[str]:
+    """Say what is another one in the evaluators that a ``run.json`` states in ``parts``; nothing where
+    it states none.
+    """
+    before = {name: facts for name, facts in stated.items() if name.startswith("evaluator ")}
+    if not before:
+        return []
+    changed = []
+    names = {f"evaluator {part.name}": part for part in evaluators}
+    for name, part in names.items():
+        facts = before.get(name)
+        if facts is None:
+            changed.append(f"{name} is new")
+        elif facts.get("digest") != part.digest:
+            files = _changes_of_part(facts, part)
+            changed += files or [f"{name} is another one"]
+    return changed + [f"{name} is left out" for name in before if name not in names]
+
+
+def sentence(count: int, all_reasons: Sequence[str], action: str = "driven") -> str:
+    """Say how many rollouts are driven or scored again, and why."""
     rollouts = "1 rollout is" if count == 1 else f"{count} rollouts are"
     causes = list(dict.fromkeys(all_reasons))
-    return f"{rollouts} driven again: {some_of(causes, SHOWN_FILES)}"
+    return f"{rollouts} {action} again: {some_of(causes, SHOWN_FILES)}"
 
 
 def _files_of(name: str, held: JsonView, plan: RunPlan) -> list[str]:
@@ -65,10 +102,16 @@ def _files_of(name: str, held: JsonView, plan: RunPlan) -> list[str]:
     for part in plan.parts:
         if not _is_part_of(f"{part.kind} {part.name}", kind, label, plan):
             continue
-        facts = stated.get(f"{part.kind} {part.name}") or {}
-        for key, now in (("code", part.code), ("files", part.files)):
-            if key in facts:
-                changes += _file_changes(facts[key], now)
+        changes += _changes_of_part(stated.get(f"{part.kind} {part.name}") or {}, part)
+    return changes
+
+
+def _changes_of_part(facts: JsonView, part: PartSpec) -> list[str]:
+    """Name the files by which a part differs from what ``run.json`` states of it."""
+    changes: list[str] = []
+    for key, now in (("code", part.code), ("files", part.files)):
+        if key in facts:
+            changes += _file_changes(facts[key], now)
     return changes
 
 

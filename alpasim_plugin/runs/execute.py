@@ -30,7 +30,7 @@ from alpasim_plugin.runs.cell import (
     run_cell,
     users_parts,
 )
-from alpasim_plugin.runs.changes import reasons, sentence
+from alpasim_plugin.runs.changes import reasons, score_reasons, sentence
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import Lost, apart, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
@@ -124,14 +124,16 @@ def execute(
         root: Its folder.
         how: Workers, checks, limits.
         on_done: Called with each manifest.
-        notify: Called with one line for each damaged rollout, one that says what is driven again and
-            why, and one for each failure that is kept.
+        notify: Called with one line for each damaged rollout, one each that says what is driven or
+            scored again and why, and one for each failure that is kept.
         held: What ``run.json`` said before; it names the files of what is driven again.
         hanging: By policy what its check says, where it hung or died: such a policy is not driven.
     """
     work = _sort_cells(plan, root, how, on_done, notify, held, hanging)
     if work.n_again:
         notify(sentence(work.n_again, work.causes))
+    if work.score_causes:
+        notify(sentence(work.n_scored, work.score_causes, "scored"))
 
     def take(done: Done) -> None:
         for cell, manifest in done:
@@ -158,6 +160,8 @@ class _Work:
         copies: What is to be copied, with its original.
         n_again: How many of ``todo`` have been driven before.
         causes: Why those are driven again.
+        n_scored: How many whole rollouts are scored again.
+        score_causes: Why those are.
     """
 
     manifests: dict[Path, JsonObject] = field(default_factory=dict)
@@ -165,6 +169,8 @@ class _Work:
     copies: list[tuple[Cell, Cell]] = field(default_factory=list)
     n_again: int = 0
     causes: list[str] = field(default_factory=list)
+    n_scored: int = 0
+    score_causes: list[str] = field(default_factory=list)
 
 
 def _sort_cells(
@@ -210,6 +216,9 @@ def _sort_cells(
         if manifest["status"] != "ok":
             notify(kept_failure(cell, manifest))
         if action == "score":
+            if not state.damage:
+                work.n_scored += 1
+                work.score_causes += score_reasons(manifest, held, plan)
             manifest = _rescored(cell, plan, root, manifest, how)
         work.manifests[cell.folder] = manifest
         on_done(manifest, True)

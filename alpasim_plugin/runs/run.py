@@ -13,6 +13,7 @@ from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
@@ -365,10 +366,9 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             },
             "bases": {spec.name: spec.base.name for spec in fixed},
             "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
-            "parts": {f"{part.kind} {part.name}": part.as_dict() for part in parts},
+            **stated_parts(parts),
             "code": {"loop": package_digest()[:12], "scoring": package_digest()[:12]},
             "metrics": table_of(parts).as_dict(),
-            "unseen": {f"{part.kind} {part.name}": part.unseen for part in parts if part.unseen},
             "weights": {file: sha for part in parts for file, sha in part.files.items()},
             "hardware": hardware(),
             "versions": versions(),
@@ -377,6 +377,15 @@ def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: T
             ),
         },
     )
+
+
+def stated_parts(parts: Sequence[PartSpec]) -> JsonObject:
+    """Return what ``run.json`` says of parts: what they are, and what of them no key can hold."""
+    named = {f"{part.kind} {part.name}": part for part in parts}
+    return {
+        "parts": {name: part.as_dict() for name, part in named.items()},
+        "unseen": {name: part.unseen for name, part in named.items() if part.unseen},
+    }
 
 
 def origin_of(command: Sequence[str]) -> JsonObject:

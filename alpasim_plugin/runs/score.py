@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.files import file_sha256, real
+from alpasim_plugin.core.files import file_sha256, real, some_of
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, digest
@@ -16,9 +16,10 @@ from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
 from alpasim_plugin.log.run_folder.writer import unfinish, write_parquet, write_scene, writing
+from alpasim_plugin.runs.changes import changed_evaluators
 from alpasim_plugin.runs.execute import Threads
 from alpasim_plugin.runs.provenance import hardware, versions
-from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of
+from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of, stated_parts
 from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, score_logs
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.alpasim import (
@@ -31,7 +32,7 @@ from evaluators.alpasim import (
     results_summary,
     scene_score,
 )
-from evaluators.metrics import METRICS, MetricTable, table_of
+from evaluators.metrics import METRICS, table_of
 from evaluators.metrics.presets import Preset
 from evaluators.results import Summary, to_json
 from evaluators.statistics.reduce import RolloutValue
@@ -63,6 +64,7 @@ def execute_score(
     root: Path | None,
     command: Sequence[str],
     on_done: Callable[[JsonObject], None],
+    noticed: Callable[[str], None],
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
     aggregation.
@@ -76,6 +78,8 @@ def execute_score(
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
+        noticed: Called with one line that says what is another one in the evaluators than when the
+            same command scored into the folder before.
 
     Raises:
         InputError: The folder holds other results, or a log's scene is not among ``scenes``.
@@ -86,17 +90,22 @@ def execute_score(
         "logs": sorted(file_sha256(log) for log in logs),
         "scenes": scenes.places,
         "preset": preset.as_dict(),
+        "evaluators": sorted(part.name for part in evaluators),
     }
     key = digest(facts)[:12]
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
-        held = key
+        held: JsonObject = {}
         with suppress(InputError):  # a damaged run.json is written again
-            held = str(read_run_json(root)["key"])
-        if held != key:
+            held = read_run_json(root)
+        if held.get("key", key) != key:
             raise InputError(
-                f"{root}: the folder holds other results (key {held})", "Name another --out."
+                f"{root}: the folder holds other results (key {held['key']})",
+                "Name another --out.",
             )
+        changes = changed_evaluators(held.get("parts") or {}, evaluators)
+        if changes:
+            noticed(f"scored again: {some_of(changes)}")
         unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
         more: JsonObject = {}
@@ -106,7 +115,7 @@ def execute_score(
         manifests = [one.manifest for one in scores]
         for manifest in manifests:
             write_manifest(root / manifest["path"], manifest)
-        _write_info(root, key, scores, scenes, preset, settings, command, table_of(evaluators))
+        _write_info(root, key, scores, scenes, preset, settings, command, evaluators)
         allowed = settings is not None and settings.allow_aggregation_with_failed_rollouts
         code = exit_code(scores, allowed, error)
         more["pool"] = pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None)
@@ -209,7 +218,7 @@ def _write_info(
     preset: Preset,
     settings: EvalSettings | None,
     command: Sequence[str],
-    metrics: MetricTable,
+    evaluators: Sequence[PartSpec],
 ) -> None:
     used = {
         log_score.manifest["scene"]: scenes.of(log_score.manifest["scene"])
@@ -247,7 +256,8 @@ def _write_info(
                 for name, scene in used.items()
             },
             "code": {"scoring": package_digest()[:12]},
-            "metrics": metrics.as_dict(),
+            "metrics": table_of(evaluators).as_dict(),
+            **stated_parts(evaluators),
             "weights": {},
             "hardware": hardware(),
             "versions": versions(),

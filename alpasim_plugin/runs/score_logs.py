@@ -14,6 +14,7 @@ from pathlib import Path
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.files.config import load_yaml
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, require_installed
@@ -22,7 +23,14 @@ from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.log.run_folder.schema import KEYS, LOG_NAME, MANIFEST, RUN_INFO, rollout_folder
+from alpasim_plugin.log.run_folder.schema import (
+    KEYS,
+    LOG_NAME,
+    MANIFEST,
+    RUN_INFO,
+    SCORE_INPUTS,
+    rollout_folder,
+)
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
 from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.plan import ref_of
@@ -205,9 +213,15 @@ def _values_of_log(
 def _values(
     rollout: RolloutLog, scene: Scene, preset: Preset, evaluators: Sequence[PartSpec]
 ) -> Values:
-    """Return the series of a log, and the rows and facts that `tabulate` makes of them."""
-    series = tuple(score(rollout, scene, preset, evaluators))
-    return series, *tabulate(rollout, series, preset)
+    """Return the series of a log, and the rows and facts that `tabulate` makes of them, with the
+    files that evaluators read beside their code.
+    """
+    with Inputs() as inputs:
+        series = tuple(score(rollout, scene, preset, evaluators))
+    rows, facts = tabulate(rollout, series, preset)
+    stated = {path for part in evaluators for path in (*part.code, *part.files)}
+    read = {path: content for path, content in inputs.files.items() if path not in stated}
+    return series, rows, facts | {SCORE_INPUTS: read}
 
 
 def check_vouched(log: Path) -> None:

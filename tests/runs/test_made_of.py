@@ -4,7 +4,10 @@ why.
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,8 +25,10 @@ from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
+from alpasim_plugin.runs.changes import changed_evaluators
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.same_poses import images_key
+from evaluators import resolve_evaluators
 from scenarios import cameras
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
@@ -357,3 +362,93 @@ def test_a_record_holds_files_by_content_settings_by_value_and_inner_records(tmp
     assert (inner.settings, outer.settings) == ({"size": 3}, {})
     with pytest.raises(ValueError, match="size"):
         inner.setting("size", 4)
+
+
+EVALUATOR = """
+import scale_of_mine
+from alpasim_plugin.core.files import read_json
+from alpasim_plugin.core.types import MetricInfo
+from evaluators.metrics.score import series
+
+class Mine:
+    metrics = {"mine_m": MetricInfo("m", "lower", "max", "a constant", margin=0.1)}
+
+    def __call__(self, rollout, scene):
+        value = scale_of_mine.SCALE * read_json("{path}")["value"] * scale_of_mine.UNIT
+        return [series("mine_m", rollout.ego.t_us, value)]
+"""
+SCALE = """
+from alpasim_plugin.core.files import read_json
+UNIT = read_json("{path}")["unit"]
+SCALE = 2.0
+"""
+
+
+@pytest.fixture
+def evaluator(scene, monkeypatch):
+    """Give an evaluator that reads a file, and a module of its own that reads one."""
+    monkeypatch.chdir(scene)
+    (scene / "value.json").write_text('{"value": 1.5}')
+    (scene / "unit.json").write_text('{"unit": 1.0}')
+    (scene / "mine.py").write_text(EVALUATOR.replace("{path}", str(scene / "value.json")))
+    text = SCALE.replace("{path}", str(scene / "unit.json"))
+    (scene / "scale_of_mine.py").write_text(text)
+    (scene / "scene.yaml").write_text(SCENE.replace(HILLS, ""))
+    return scene
+
+
+EDITS_OF_AN_EVALUATOR = {
+    "value.json": ("1.5", "2.5", 5.0),
+    "unit.json": ("1.0", "10.0", 50.0),
+    "scale_of_mine.py": ("SCALE = 2.0", "SCALE = 3.0", 75.0),
+}
+
+
+def own_metric(folder, capfd, code, command):
+    """Return the metric of a run's one rollout, and what its command said."""
+    said = capfd.readouterr().err
+    assert code == 0, (command, said)
+    (manifest,) = (folder / "run").glob("rollouts/*/*/*/*/manifest.json")
+    return read_json(manifest)["metrics"]["mine_m"]["value"], said
+
+
+def test_an_evaluator_is_all_that_it_imports_and_reads(evaluator, capfd):
+    command = ["--renderer", "clean", "--policy", "constant-velocity", *WORDS]
+    command += ["--evaluator", "mine.py:Mine", "--out", "run", "scene.yaml"]
+    assert own_metric(evaluator, capfd, run_command(command), command)[0] == 3.0
+    (log,) = (evaluator / "run").glob("rollouts/*/*/*/*/rollout.asl")
+    driven_ns = log.stat().st_mtime_ns
+    for name, (before, after, expected) in EDITS_OF_AN_EVALUATOR.items():
+        text = (evaluator / name).read_text()
+        (evaluator / name).write_text(text.replace(before, after))
+        if name.endswith(".py"):  # a process does not import a module twice
+            words = [sys.executable, "-m", "alpasim_plugin.cli.main", *command]
+            code = subprocess.run(words, check=False).returncode
+        else:
+            code = run_command(command)
+        value, said = own_metric(evaluator, capfd, code, command)
+        assert value == expected
+        assert f"1 rollout is scored again: {evaluator / name} was edited" in said
+    assert log.stat().st_mtime_ns == driven_ns
+
+
+def test_score_states_evaluators_and_says_which_was_edited(evaluator, tmp_path, capfd):
+    """Scoring a log again into one folder is another command with other evaluators."""
+    driven(evaluator, capfd)
+    command = ["score", "run", "--scene", "scene.yaml", "--out", "scored"]
+    own = ["--evaluator", "mine.py:Mine"]
+    assert run_command([*command, *own]) == 0
+    info = read_json(evaluator / "scored" / "run.json")
+    assert "opens by itself" in info["unseen"]["evaluator mine.py:Mine"]
+    (manifest,) = (evaluator / "scored").glob("rollouts/*/*/*/*/manifest.json")
+    read = {evaluator / "value.json", evaluator / "unit.json"}
+    assert {Path(path) for path in read_json(manifest)["score_inputs"]} == read
+    assert run_command(command) == 2
+    stated = info["parts"] | {"evaluator mine.py:Mine": {"digest": "other", "code": {}}}
+    evaluators = resolve_evaluators(["mine.py:Mine"])
+    changes = changed_evaluators(stated, evaluators)
+    assert f"{evaluator / 'scale_of_mine.py'} was not read before" in changes
+    assert changed_evaluators(info["parts"], evaluators) == []
+    assert changed_evaluators(info["parts"], evaluators[:-1]) == [
+        "evaluator mine.py:Mine is left out"
+    ]

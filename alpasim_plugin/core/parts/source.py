@@ -21,7 +21,7 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError, is_interruption
 from alpasim_plugin.core.files import file_sha256, read_bytes
-from alpasim_plugin.core.files.inputs import unrecorded
+from alpasim_plugin.core.files.inputs import Inputs, note_files, unrecorded
 from alpasim_plugin.core.parts.blame import raised
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
@@ -36,6 +36,8 @@ IN_A_FILE = (
 )
 _imported_code: dict[Path, str] = {}  # file -> its code digest when a part of it was first resolved
 _served: dict[str, str] = {}  # module -> file, of modules that no folder on Python's path has
+# What modules read while they were imported, by module: whoever loads a part of one is made of it.
+_read_at_import: dict[str, dict[str, str]] = {}
 
 
 @lru_cache(maxsize=1)
@@ -243,8 +245,11 @@ def load(target: str, kind: str) -> Any:
     try:
         if name.endswith(".py") and not os.path.isfile(name):
             raise no_such_file(kind, Path(name))
-        module = importlib.import_module(make_importable(target))
-        member = getattr(module, attribute, None)  # a module of a file runs here
+        module_name = make_importable(target)
+        with Inputs() as inputs:
+            module = importlib.import_module(module_name)
+            member = getattr(module, attribute, None)  # a module of a file runs here
+        note_files(_read_at_import.setdefault(module_name, inputs.files))
     except InputError:
         raise
     except BaseException as error:  # whatever a user's module raises while it is imported
