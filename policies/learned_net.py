@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files import check_regular, parsing
 from alpasim_plugin.core.files.arrays import read_metadata
 from alpasim_plugin.core.files.atomic import write_safetensors
 from alpasim_plugin.core.types import F64
@@ -206,6 +206,7 @@ def load_net(path: Path) -> LearnedNet:
     Raises:
         InputError: No such file, or not weights of this network.
     """
+    check_regular(path)
     net = LearnedNet(views=read_views(path))
     wanted = {name: tuple(value.shape) for name, value in net.state_dict().items()}
     with parsing(path, "copy or train it again", "not a complete safetensors file"):
