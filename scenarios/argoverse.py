@@ -16,6 +16,7 @@ import shapely
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, real
 from alpasim_plugin.core.files.arrays import parse_npy
+from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.files.tables import Kind
 from alpasim_plugin.core.geometry import (
     centre_line,
@@ -98,6 +99,29 @@ FIXED = frozenset(
 )
 
 
+ARGOVERSE = Fields(
+    "Argoverse 2",
+    read={
+        "log": "city_SE3_egovehicle.feather map annotations.feather calibration",
+        "poses": f"timestamp_ns {' '.join(POSE)}",
+        "annotations": f"""timestamp_ns track_uuid category length_m width_m height_m
+            {" ".join(POSE)}""",
+        "map": "lane_segments drivable_areas pedestrian_crossings",
+        "lane_segment": """left_lane_boundary right_lane_boundary lane_type successors is_intersection
+            left_neighbor_id right_neighbor_id left_lane_mark_type right_lane_mark_type""",
+        "drivable_area": "area_boundary",
+        "pedestrian_crossing": "edge1 edge2",
+    },
+    harmless={
+        "log": "sensors",
+        "annotations": "num_interior_pts",
+        "lane_segment": "id predecessors",
+        "drivable_area": "id",
+        "pedestrian_crossing": "id",
+    },
+)
+
+
 def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
     """Read ``log_map_archive_*.json`` into a lane map around ``origin (3,)``, with notes on what
     could not be kept.
@@ -110,6 +134,14 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         raw_lanes = document["lane_segments"]
         raw_areas = document["drivable_areas"]
         raw_crossings = document["pedestrian_crossings"]
+        files.met += met_in("map", document)
+        for holder, things in (
+            ("lane_segment", raw_lanes),
+            ("drivable_area", raw_areas),
+            ("pedestrian_crossing", raw_crossings),
+        ):
+            for thing in things.values():
+                files.met += met_in(holder, thing)
         if not raw_lanes or not raw_areas:
             raise ValueError("a map without lanes or without drivable areas")
         raw_marks = [
@@ -270,11 +302,14 @@ def read_argoverse(path: str | Path) -> RecordedLog:
     ground = read_ground(files, folder / "map", lane_map, ego_log.xyz, origin)
     actors: tuple[Actor, ...] = ()
     actor_notes: tuple[str, ...] = (NOBODY,)
+    box_path = None
     if any(folder.glob("annotations*.feather")):
         box_path = files.only(
             folder, ("annotations.feather", "annotations*.feather"), "the annotated cuboids"
         )
         actors, actor_notes = read_actors(files, box_path, poses, origin)
+    entries = sorted(entry for entry in folder.iterdir() if entry != box_path)
+    files.met += met_in("log", (entry.name for entry in entries))
     log_notes = (
         [f"{dropped} ego poses share their microsecond with the pose before and were dropped"]
         if dropped
@@ -296,7 +331,7 @@ def read_argoverse(path: str | Path) -> RecordedLog:
         cameras=(),
         world_origin=(float(origin[0]), float(origin[1]), float(origin[2])),
         content_hash=files.content_hash,
-        notes=(*log_notes, *notes, *actor_notes),
+        notes=(*log_notes, *notes, *actor_notes, *ARGOVERSE.notes(files.met)),
     )
 
 
@@ -307,7 +342,7 @@ def read_ego_poses(files: SourceFiles, path: Path) -> EgoPoses:
         InputError: Fewer than two poses, times that do not increase, values that are not finite,
             quaternions that are not unit.
     """
-    table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS})
+    table = files.read_feather(path, {"timestamp_ns": "integer", **_NUMBERS}, "poses")
     t_ns = table["timestamp_ns"].astype(np.int64)
     xyz = _columns(table, POSE[4:])
     quat = _columns(table, POSE[:4])
@@ -328,7 +363,9 @@ def read_actors(
     sizes = ("length_m", "width_m", "height_m")
     numbers: dict[str, Kind] = dict.fromkeys((*sizes, *POSE), "number")
     table = files.read_feather(
-        path, {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers}
+        path,
+        {"timestamp_ns": "integer", "track_uuid": "text", "category": "text", **numbers},
+        "annotations",
     )
     t_ns = table["timestamp_ns"].astype(np.int64)
     uuid = table["track_uuid"].astype(str)

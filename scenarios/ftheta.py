@@ -22,6 +22,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
+from scenarios.usdz_fields import met_in_sensor
 
 FRONT_WIDE = "camera_front_wide_120fov"
 # Rendered size; the recorded frames are 1920 x 1080.
@@ -105,6 +106,7 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
         return (), (
             f"no calibration of {FRONT_WIDE} in this scene: the default front camera is used",
         )
+    archive.files.met += met_in_sensor(sensor)
     with parsing(f"{archive.path}, {FRONT_WIDE}", GIVE):
         camera = front_camera(np.array(_lens_numbers(sensor["properties"])[0]), mount(sensor))
     return (camera,), (

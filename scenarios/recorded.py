@@ -18,6 +18,7 @@ from pyarrow import feather
 
 from alpasim_plugin.core import files as reading
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.fields import met_in
 from alpasim_plugin.core.files.limits import COORDINATE_M, SOURCE_BYTES
 from alpasim_plugin.core.files.reading import parse_xml
 from alpasim_plugin.core.files.tables import Kind, check_columns
@@ -62,10 +63,15 @@ def near(location: Path | str, xyz: F64) -> F64:
 
 
 class SourceFiles:
-    """Reads the files of one recorded log and hashes what it read."""
+    """Reads the files of one recorded log and hashes what it read.
+
+    Attributes:
+        met: Names of the fields of the files that were read, for `Fields.notes`.
+    """
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
+        self.met: list[str] = []
 
     @property
     def content_hash(self) -> str:
@@ -119,9 +125,14 @@ class SourceFiles:
         return reading.parse_json(self.read_bytes(path), path)
 
     def read_feather(
-        self, path: Path, columns: Mapping[str, Kind]
+        self, path: Path, columns: Mapping[str, Kind], holder: str = ""
     ) -> dict[str, np.ndarray[Any, Any]]:
         """Read columns of a feather file (Arrow IPC).
+
+        Args:
+            path: The file.
+            columns: Columns that must be there, by type.
+            holder: Name under which the file's columns are entered into `met`; nothing enters none.
 
         Raises:
             InputError: The file is damaged or truncated, lacks a column, or has one of another type
@@ -133,6 +144,8 @@ class SourceFiles:
             table = feather.read_table(pa.BufferReader(data))
             table.validate(full=True)
         check_columns(table, columns, path, "use a file of the Argoverse 2 sensor set")
+        if holder:
+            self.met += met_in(holder, table.column_names)
         nulls = next((name for name in columns if table.column(name).null_count), None)
         if nulls is not None:
             raise InputError(

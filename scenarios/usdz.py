@@ -31,6 +31,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.fields import field_name, met_in
 from alpasim_plugin.core.files.reading import parse_xml
 from alpasim_plugin.core.geometry import heading_of, quat_from_matrix, transform_points
 from alpasim_plugin.core.json_types import JsonObject
@@ -42,11 +43,12 @@ from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road, beside, cubics_at, parse_map
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory
 from scenarios.usdz_archive import Archive
+from scenarios.usdz_fields import META, RIG, USDZ, met_in_rig, met_in_sequence
 from scenarios.usdz_tables import clipgt_map
 
-RIG_MEMBER = "rig_trajectories.json"
 RECONSTRUCTIONS = ("checkpoint.ckpt", "nerf.ingp", "volume.nurec")
 GROUND_CELL_M = 2.0
+MOST_TURNED = 1e-3  # by which the ego's body may be turned against the rig
 # Words in AlpaSim's free-text labels, the first match deciding; all else is "other".
 LABELS = (
     ("motor", "motorcycle"),  # a motorcyclist is no cyclist
@@ -97,12 +99,13 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
     files = SourceFiles()
     with Archive(files, path) as archive:
         scene_id = _scene_id(archive)
-        location = f"{path}, {RIG_MEMBER}"
-        rig = archive.json(RIG_MEMBER)
+        location = f"{path}, {RIG}"
+        rig = archive.json(RIG)
         with parsing(location, "give exactly one rig trajectory, as AlpaSim writes it"):
+            files.met += met_in_rig(rig)
             (trajectory,) = rig["rig_trajectories"]
             ego_log = _ego_log(trajectory, location)
-            vehicle, vehicle_notes = _vehicle(trajectory)
+            vehicle, vehicle_notes = _vehicle(trajectory, location)
             first_frame_us = _first_frame_us(rig)
         road = _road(archive, rig)
         if needs_map and not road.lane_map.lanes:
@@ -116,6 +119,9 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
         inside = ", ".join(
             f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive
         )
+        files.met += [
+            part if "/" in part else field_name("archive", part) for part in archive.parts
+        ]
     surface = [*lane_edges(road.lane_map.lanes), *road.lane_map.road_edges, ego_log.xyz]
     ground = from_points(np.concatenate(surface), GROUND_CELL_M, ego_log.xyz)
     model = f"{inside} is a checkpoint of a closed renderer and is not read"
@@ -125,6 +131,7 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
         *road.notes,
         *camera_notes,
         *vehicle_notes,
+        *USDZ.notes(files.met),
     ]
     if static:
         notes.append(
@@ -158,12 +165,12 @@ def usdz_scene_id(path: str | Path) -> str:
 
 
 def _scene_id(archive: Archive) -> str:
-    document = archive.yaml("metadata.yaml")
+    document = archive.yaml(META)
+    if isinstance(document, dict):
+        archive.files.met += met_in(META, document)
     scene_id = document.get("scene_id") if isinstance(document, dict) else None
     if not isinstance(scene_id, str) or not scene_id:
-        raise InputError(
-            f"{archive.path}, metadata.yaml: scene_id {scene_id!r}", "state the scene's id"
-        )
+        raise InputError(f"{archive.path}, {META}: scene_id {scene_id!r}", "state the scene's id")
     return scene_id
 
 
@@ -175,7 +182,7 @@ def _road(archive: Archive, rig: JsonObject) -> RoadMap:
         return RoadMap(LaneMap({}), None, (*notes, "no map: neither tables nor map.xodr"))
     location = f"{archive.path}, map.xodr"
     odr = parse_map(location, parse_xml(archive.read("map.xodr"), location))
-    with parsing(f"{archive.path}, {RIG_MEMBER}", "give T_world_base, 4 x 4"):
+    with parsing(f"{archive.path}, {RIG}", "give T_world_base, 4 x 4"):
         T_earth_local = np.array(rig["T_world_base"], np.float64).reshape(4, 4)
         place = T_local_map(odr.geo_reference, T_earth_local)
     lane_map, more = lane_map_of(location, odr, place)
@@ -210,8 +217,12 @@ def _first_frame_us(rig: JsonObject) -> int | None:
     return ends.get(FRONT_WIDE, min(ends.values(), default=None))
 
 
-def _vehicle(rig: JsonObject) -> tuple[Vehicle, tuple[str, ...]]:
-    """Return the ego's body and notes."""
+def _vehicle(rig: JsonObject, location: str) -> tuple[Vehicle, tuple[str, ...]]:
+    """Return the ego's body and notes.
+
+    Raises:
+        InputError: The body is turned against the rig.
+    """
     box = rig.get("rig_bbox")
     if box is None:
         return Vehicle(), (
@@ -220,6 +231,12 @@ def _vehicle(rig: JsonObject) -> tuple[Vehicle, tuple[str, ...]]:
     ahead, left, up = map(float, box["centroid"])
     length, width, height = (round(float(side), 6) for side in box["dim"])
     above = up - height / 2
+    turn = np.abs(np.array(box.get("rot") or (0.0, 0.0, 0.0), np.float64))
+    if not turn.max(initial=0.0) < MOST_TURNED:
+        raise InputError(
+            f"{location}: rig_bbox, rot: {box['rot']}, a body that is turned against the rig",
+            "give a rig along the body, with rot 0",
+        )
     notes: tuple[str, ...] = ()
     if max(abs(left), abs(above)) > 1e-3:
         notes = (
@@ -235,6 +252,7 @@ def _actors(archive: Archive) -> tuple[Actor, ...]:
     actors: dict[str, Actor] = {}
     with parsing(location, "give one sequence, with lists of equal length, 7 numbers a pose"):
         (sequence,) = document.values()
+        archive.files.met += met_in_sequence(sequence)
         tracks = sequence["tracks_data"]
         columns = [
             tracks[f"tracks_{name}"]

@@ -9,14 +9,19 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.config import parse
+from alpasim_plugin.core.files.fields import field_name, met_in
 from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
 from alpasim_plugin.core.files.reading import check_names, open_regular
 from alpasim_plugin.core.files.tables import parse_parquet
 from alpasim_plugin.core.json_types import JsonObject
 from scenarios.recorded import SourceFiles
+
+TABLE_FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts
 
 
 class Archive:
@@ -80,6 +85,18 @@ class Archive:
         self.files.note_bytes(member, data)
         return data
 
+    @property
+    def parts(self) -> list[str]:
+        """Return the names of members at the top, of folders, and of tables in the folders of
+        tables, each one once.
+        """
+        names: dict[str, None] = {}
+        for member in self._infos:
+            first, _, below = member.partition("/")
+            is_table = first in TABLE_FOLDERS and below.endswith(".parquet")
+            names[field_name("tables", Path(below).stem) if is_table else first] = None
+        return list(names)
+
     def json(self, member: str) -> Any:
         """Read a JSON member."""
         return parse_json(self.read(member), f"{self.path}, {member}")
@@ -97,5 +114,13 @@ class Archive:
     def table(self, member: str) -> list[JsonObject]:
         """Read a parquet member as rows."""
         location = f"{self.path}, {member}"
+        name = Path(member).stem
         with parsing(location, "fetch the file again", "no readable parquet"):
-            return parse_parquet(self.read(member), location).to_pylist()
+            table = parse_parquet(self.read(member), location)
+            for column in table.schema:
+                holder = column.name if column.name in ("key", name) else ""
+                if holder and pa.types.is_struct(column.type):
+                    self.files.met += met_in(holder, (part.name for part in column.type))
+                else:
+                    self.files.met.append(field_name(name, column.name))
+            return table.to_pylist()

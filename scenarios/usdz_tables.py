@@ -26,9 +26,8 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap
 from scenarios.map_lines import NO_LANES_OF_CARS, predecessors, rails, with_vertices
 from scenarios.recorded import MAX_REACH_M
-from scenarios.usdz_archive import Archive
+from scenarios.usdz_archive import TABLE_FOLDERS, Archive
 
-FOLDERS = ("map_data", "clipgt", "fastmap")  # the first usable one counts
 TABLES = ("lane", "association", "road_boundary", "clip", "traffic_sign", "wait_line")
 RAILS = ("left_rail", "right_rail")
 SIGN = Box(0.1, 0.75, 0.75)  # the table has no size
@@ -63,7 +62,7 @@ def clipgt_map(archive: Archive) -> tuple[LaneMap | None, tuple[str, ...]]:
         InputError: A lane lacks a rail, its rails differ in length, or a coordinate is not finite.
     """
     notes = []
-    for folder in FOLDERS:
+    for folder in TABLE_FOLDERS:
         missing = [table for table in TABLES if f"{folder}/{table}.parquet" not in archive]
         if len(missing) == len(TABLES):
             continue

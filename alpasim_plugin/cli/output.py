@@ -177,7 +177,13 @@ def headline(plan: RunPlan, root: Path, threads: Threads) -> list[str]:
     )
     cores = f"{plural(threads.workers, 'worker')} x {plural(threads.per_worker, 'thread')}"
     size = f"{plural(len(plan.cells), 'rollout')} ({' x '.join(axes)}), {cores}"
-    notes = [*fixer_labels(plan), *size_lines(plan), *varied_lines(plan), *background_lines(plan)]
+    notes = [
+        *fixer_labels(plan),
+        *policy_notes(plan),
+        *size_lines(plan),
+        *varied_lines(plan),
+        *background_lines(plan),
+    ]
     return [f"{size} -> {root}", *notes]
 
 
@@ -257,6 +263,20 @@ def fixer_labels(plan: RunPlan) -> list[str]:
         if spec.fixer is not None:
             mode = getattr(spec.fixer.settings, "loop_mode", "")
             lines.append(f"{spec.name}: {spec.fixer.label}" + (f", {mode}" if mode else ""))
+    return lines
+
+
+def policy_notes(plan: RunPlan) -> list[str]:
+    """Return a line for each thing that a policy with an address does not read of its files."""
+    from alpasim_plugin.core.parts.source import load
+
+    lines = []
+    for spec in plan.policies:
+        if spec.address is not None:
+            factory = load(spec.target, "policy")
+            notes_of = getattr(factory, "address_notes", None)
+            notes = () if notes_of is None else notes_of(spec.address)
+            lines += [f"{spec.name}: {note}" for note in notes]
     return lines
 
 

@@ -6,7 +6,7 @@ a DBC. Nothing of a frame is trusted before all checks have passed.
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,8 +18,30 @@ from pydantic import BaseModel, ConfigDict, Field
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import check_regular
 from alpasim_plugin.core.files.config import load_yaml, validate
+from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.lazy import require_library
 
+# Attributes are those of the messages that a map names, and of their signals. Periods and causes of
+# sending are the map's; a start value is sent, an inactive or a default one never.
+DBC = Fields(
+    "CAN database",
+    read={
+        "message": "BO_ @VFrameFormat",
+        "signal": "SG_ VAL_ SIG_VALTYPE_ @GenSigStartValue",
+    },
+    harmless={
+        "message": """CM_ @GenMsgCycleTime @GenMsgCycleTimeActive @GenMsgCycleTimeFast @GenMsgDelayTime
+            @GenMsgFastOnStart @GenMsgILSupport @GenMsgNrOfRepetition @GenMsgNrOfRepetitions
+            @GenMsgRepetitions @GenMsgSendType @GenMsgStartDelayTime @GenMsgStartDelay
+            @GenMsgStartValue @DiagRequest @DiagResponse @DiagState @DiagUudtResponse
+            @NmAsrMessage @NmMessage @TpTxIndex @TpApplType @SystemMessageLongSymbol""",
+        "signal": """CM_ @GenSigSendType @GenSigCycleTime @GenSigCycleTimeActive @GenSigILSupport
+            @GenSigMissingSourceValue @GenSigEVName @GenSigInactiveValue @GenSigTimeoutTime
+            @GenSigTimeoutValue @GenSigTimeoutMsg @GenSigSNA @GenSigFuncType @SPN @SigType
+            @SystemSignalLongSymbol @NWM-WakeupAllowed""",
+    },
+    moving={"message": "multiplexing"},
+)
 FrameId = tuple[int, bool]  # identifier, and whether it is an extended one of 29 bits
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "can"
 
@@ -129,6 +151,7 @@ class Codec:
 
     map: CanMap
     database: Any
+    notes: tuple[str, ...] = ()  # on attributes of the database that are not read
     _counters: dict[str, int] = field(default_factory=dict)
 
     def message(self, name: str) -> Any:
@@ -239,7 +262,19 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             ) from refusal
         if codec.message(part.message).is_multiplexed():
             raise InputError(f"{location}: it is multiplexed", "name messages of one layout")
+    codec.notes = DBC.notes(_met(codec))
     return codec
+
+
+def _met(codec: Codec) -> Iterator[str]:
+    """Yield the names of the attributes that a map's messages and their signals have."""
+    for name in dict.fromkeys(part.message for part in codec.map.parts):
+        message = codec.message(name)
+        specifics = [("message", message.dbc)]
+        specifics += [("signal", signal.dbc) for signal in message.signals]
+        for holder, specific in specifics:
+            if specific is not None:  # a database in another form than DBC
+                yield from met_in(holder, (f"@{key}" for key in specific.attributes))
 
 
 def is_fd(message: Any) -> bool:

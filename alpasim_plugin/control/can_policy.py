@@ -76,6 +76,12 @@ class CanPolicy(Policy):
         parsed = Address.parse(address)
         open_codec(*load_map(parsed.map, parsed.dbc))
 
+    @classmethod
+    def address_notes(cls, address: str) -> tuple[str, ...]:
+        """Return what is not read of the database that an address names."""
+        parsed = Address.parse(address)
+        return open_codec(*load_map(parsed.map, parsed.dbc)).notes
+
     def reset(self, seed: int, route: Route) -> None:
         """Start a new rollout on the same bus: counts, commands and motion begin anew."""
         self._exchange = Exchange(self._bus, self._codec, self._address.timeout_s)
@@ -136,6 +142,7 @@ class CanPolicy(Policy):
     def facts(self) -> Mapping[str, Any]:
         """Return what happened on the bus, for the rollout's manifest."""
         return {
+            "notes": list(self._codec.notes),
             "bus": f"{self._address.interface}:{self._address.channel}",
             **self._exchange.facts(),
         }

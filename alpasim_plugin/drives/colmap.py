@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +21,7 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import natural_order, read_bytes, real
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.files.reading import parsing
 from alpasim_plugin.core.geometry import inverse, se3
@@ -35,6 +36,7 @@ PLACES = ("", "sparse", "colmap/sparse")  # of models below a folder, or of fold
 IMAGES = ("images", "", "../images", "../../images")
 CAMERA = 0  # the kind of a sensor that takes images
 T = TypeVar("T")
+UNIT = 1e-2  # how far from 1 the length of a quaternion may be
 SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
 # Lens models in the order of their numbers; those without a count in `PARAMETERS` are refused.
 _NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
@@ -55,6 +57,26 @@ PARAMETERS = {
 }
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
+COLMAP = Fields(
+    "COLMAP",
+    read={
+        "model": "cameras images points3D rigs frames",
+        "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
+        "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
+        "points3D": "X Y Z R G B",
+        "rigs": "RIG_ID SENSORS POSES",
+        "frames": "RIG_ID RIG_FROM_WORLD DATA_IDS",
+    },
+    harmless={
+        "model": "project",
+        "images": "POINTS2D",
+        "points3D": "POINT3D_ID ERROR TRACK",
+        "frames": "FRAME_ID",
+    },
+)
+RIG_TURN = 1e-3  # radians; rotations of an image and of its rig that differ by more do not agree
+RIG_SHIFT = 1e-3  # the same of shifts, as a share of the larger one, or in the model's unit
+
 
 @dataclass(frozen=True)
 class _Image:
@@ -62,6 +84,21 @@ class _Image:
     name: str
     camera: int
     T_world_camera: F64
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Images that the cameras of a rig took at one time.
+
+    Attributes:
+        rig: Number of the rig.
+        T_rig_world: ``(4, 4)``.
+        images: Number of a camera to the number of its image.
+    """
+
+    rig: int
+    T_rig_world: F64
+    images: Mapping[int, int]
 
 
 def models_in(folder: Path) -> list[Path]:
@@ -136,6 +173,9 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
     spread = np.eye(3) * ((SPREAD * near) ** 2)[:, None, None]
     points = Points(table[:, :3], table[:, 3:] / 255.0, spread)
     notes += rig_notes
+    notes += COLMAP.notes(
+        field_name("model", path.stem) for path in model.iterdir() if path.suffix == _ending(model)
+    )
     notes.append(
         f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
     )
@@ -152,8 +192,11 @@ def _rig_times(
 
     Frames are in the natural order of the names of the reference camera's images.
     """
-    rigs = {number: found for number, found in _records(model, "rigs", _rig) if len(found) > 1}
-    frames = [(rig, taken) for rig, taken in _records(model, "frames", _frame) if rig in rigs]
+    mounts = {number: sensors for number, sensors in _records(model, "rigs", _rig) if sensors}
+    rigs = {number: list(sensors) for number, sensors in mounts.items() if len(sensors) > 1}
+    all_frames = _records(model, "frames", _frame)
+    _check_rigs(model, images, mounts, all_frames)
+    frames = [(frame.rig, frame.images) for frame in all_frames if frame.rig in rigs]
     if not frames:
         return {}, None, []
     counts = Counter(rig for rig, _ in frames)
@@ -175,6 +218,35 @@ def _rig_times(
             f"{left_out} images of other rigs, or of frames without the reference camera, are left out"
         )
     return times_us, reference, notes
+
+
+def _check_rigs(
+    model: Path,
+    images: Sequence[_Image],
+    mounts: Mapping[int, Mapping[int, F64 | None]],
+    frames: Sequence[_Frame],
+) -> None:
+    """Refuse a model whose images do not stand where their frame and their rig say.
+
+    Raises:
+        InputError: Names the first such image.
+    """
+    T_world_camera = {image.number: image.T_world_camera for image in images}
+    names = {image.number: image.name for image in images}
+    for frame in frames:
+        for camera, number in frame.images.items():
+            T_camera_rig = mounts.get(frame.rig, {}).get(camera)
+            if number not in T_world_camera or T_camera_rig is None:
+                continue
+            away = T_camera_rig @ frame.T_rig_world @ T_world_camera[number]
+            turn = float(np.arccos(np.clip((np.trace(away[:3, :3]) - 1) / 2, -1.0, 1.0)))
+            largest = max(1.0, float(np.abs(T_world_camera[number][:3, 3]).max()))
+            shift = float(np.abs(away[:3, 3]).max())
+            if turn > RIG_TURN or shift > RIG_SHIFT * largest:
+                raise InputError(
+                    f"{model}, image {names[number]}: its pose is {shift:.3g} units and {np.degrees(turn):.2f} degrees from where its frame and rig say",
+                    "write the whole model again with COLMAP",
+                )
 
 
 def _folder(name: str) -> str:
@@ -209,9 +281,20 @@ def _records(model: Path, name: str, record: Callable[[_Binary | _Words], T]) ->
             if name == "images":  # below each stands a line of its points, unless they are left out
                 lines = [line for line in lines if not _are_points(line.split())]
             most = 9 if name == "images" else -1  # a name may have spaces
-            return [record(_Words(line.split(maxsplit=most))) for line in lines]
+            return [_of_line(record, line.split(maxsplit=most)) for line in lines]
         reader = _Binary(data)
-        return [record(reader) for _ in range(reader.take("Q")[0])]
+        records = [record(reader) for _ in range(reader.take("Q")[0])]
+        if reader.at != len(data):
+            raise ValueError(f"{len(data) - reader.at} bytes after the last record")
+        return records
+
+
+def _of_line(record: Callable[[_Binary | _Words], T], words: Sequence[str]) -> T:
+    """Return the record of a line of a text file, which must be used up by it."""
+    reader = _Words(words)
+    value = record(reader)
+    reader.check_end()
+    return value
 
 
 def _are_points(words: Sequence[str]) -> bool:
@@ -272,6 +355,17 @@ class _Words:
 
     def skip(self, size: int) -> None:
         """Leave the rest of the line."""
+        self.words = iter(())
+
+    def check_end(self) -> None:
+        """Refuse words that nothing was read of.
+
+        Raises:
+            ValueError: A line goes on.
+        """
+        more = next(self.words, None)
+        if more is not None:
+            raise ValueError(f"a line goes on with {more!r}")
 
 
 def _camera(reader: _Binary | _Words) -> tuple[int, Lens]:
@@ -299,7 +393,7 @@ def _image(reader: _Binary | _Words) -> _Image:
     name = reader.name()
     reader.skip(24)  # points: x, y and a number
     length = np.linalg.norm(pose[:4])
-    if not np.isfinite(pose).all() or abs(length - 1) > 1e-2:
+    if not np.isfinite(pose).all() or abs(length - 1) > UNIT:
         raise InputError(
             f"image {name}: its pose is not finite or no rotation",
             "give unit quaternions and finite shifts",
@@ -313,19 +407,32 @@ def _point(reader: _Binary | _Words) -> tuple[float, ...]:
     return values[1:7]
 
 
-def _rig(reader: _Binary | _Words) -> tuple[int, list[int]]:
-    """Return a rig's number and its cameras, the reference first."""
+def _rig(reader: _Binary | _Words) -> tuple[int, dict[int, F64 | None]]:
+    """Return a rig's number, and its cameras, the reference first, with what maps the rig to them
+    ``(4, 4)``; None where that is not stated.
+    """
     number, count = reader.take("II")
-    sensors = []
+    mounts: dict[int, F64 | None] = {}
     for i in range(count):
-        sensors.append(reader.take("iI"))
+        kind, sensor = reader.take("iI")
+        mount: F64 | None = None if i else np.eye(4)
         if i > 0 and reader.take("B")[0]:
-            reader.take("ddddddd")  # its pose on the rig
-    return number, [sensor for kind, sensor in sensors if kind == CAMERA]
+            mount = _pose(reader.take("ddddddd"))
+        if kind == CAMERA:
+            mounts[sensor] = mount
+    return number, mounts
 
 
-def _frame(reader: _Binary | _Words) -> tuple[int, dict[int, int]]:
-    """Return a frame's rig, and its images by camera."""
-    _, rig, *_, count = reader.take("IIdddddddI")
+def _frame(reader: _Binary | _Words) -> _Frame:
+    _, rig, *pose, count = reader.take("IIdddddddI")
     taken = [reader.take("iIQ") for _ in range(count)]
-    return rig, {sensor: image for kind, sensor, image in taken if kind == CAMERA}
+    images = {sensor: image for kind, sensor, image in taken if kind == CAMERA}
+    return _Frame(rig, _pose(pose), images)
+
+
+def _pose(numbers: Sequence[float]) -> F64:
+    """Return the transform ``(4, 4)`` of ``wxyz`` and a shift."""
+    length = np.linalg.norm(numbers[:4])
+    if not np.isfinite(numbers).all() or abs(length - 1) > UNIT:
+        raise ValueError(f"the pose {list(numbers)} is not finite or no rotation")
+    return se3(numbers[4:], np.array(numbers[:4]) / length)

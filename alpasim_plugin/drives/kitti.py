@@ -23,6 +23,7 @@ from alpasim_plugin.core.files import (
     real,
     some_of,
 )
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.images import check_image
 from alpasim_plugin.core.geometry import shifted
 from alpasim_plugin.core.types import F64
@@ -41,15 +42,27 @@ ROWS = {
     "image_2": "P2",
     "image_3": "P3",
 }
-# Rows that say nothing of a rectified camera: other sensors, and how raw images were rectified.
-UNUSED = re.compile(r"Tr.*|[RSKDT](_rect)?_?\d*(_rect)?|calib_time|corner_dist")
+CALIBRATION = "calib.txt"
+KITTI = Fields(
+    "KITTI odometry",
+    read={
+        "folder": "calib.txt poses.txt times.txt image_0 image_1 image_2 image_3 image_l image_r",
+        CALIBRATION: "P# P_rect_#",
+    },
+    # Other sensors, and how raw images were rectified: what is read of a rectified camera is whole.
+    harmless={
+        "folder": "velodyne",
+        CALIBRATION: """Tr Tr_velo_cam Tr_velo_to_cam Tr_imu_to_velo Tr_cam_to_road R_rect R#_rect R_rect_#
+            S_# S_rect_# K_# D_# R_# T_# calib_time corner_dist""",
+    },
+)
 SUFFIXES = (".png", ".jpg", ".jpeg")
 ROW_OF_12 = "give a row of 12 numbers for each, and no header"
 
 
 def is_kitti(folder: Path) -> bool:
     """Look for ``calib.txt`` beside a folder of left images."""
-    return os.path.isfile(folder / "calib.txt") and any(
+    return os.path.isfile(folder / CALIBRATION) and any(
         os.path.isdir(folder / left) for left, _ in PAIRS
     )
 
@@ -62,7 +75,7 @@ def read_kitti(folder: Path) -> SourceDrive:
             it.
     """
     left, right = next(pair for pair in PAIRS if os.path.isdir(folder / pair[0]))
-    projections, notes = _projections(folder / "calib.txt")
+    projections, notes = _projections(folder / CALIBRATION)
     poses = _poses(folder)
     files = {}
     for name in (left, right):
@@ -74,7 +87,7 @@ def read_kitti(folder: Path) -> SourceDrive:
     times = _times(folder / "times.txt", len(poses), notes)
     photographs = []
     for name, rows in _rows_of_poses(folder, files, len(poses)).items():
-        K, T_left_camera = _camera(projections, name, folder / "calib.txt")
+        K, T_left_camera = _camera(projections, name, folder / CALIBRATION)
         spare = []
         for i, path in zip(rows, files[name], strict=True):
             if i >= len(poses):
@@ -93,6 +106,7 @@ def read_kitti(folder: Path) -> SourceDrive:
     others = [name for name in ROWS if name not in files and os.path.isdir(folder / name)]
     if others:
         notes.append(f"not read: {', '.join(others)}")
+    notes += KITTI.notes(field_name("folder", entry.name) for entry in folder.iterdir())
     return SourceDrive(
         "kitti",
         real(folder).name,
@@ -151,28 +165,29 @@ def _poses(folder: Path) -> list[F64]:
 
 
 def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
-    """Return the projections by the names of their rows, P0 on, and notes on unknown rows.
+    """Return the projections by the names of their rows, P0 on, and notes on rows that are not
+    read.
 
     Rows without names count from P0.
     """
     rows = {}
-    unknown = []
+    met = []
     lines = [line for line in read_text(path).splitlines() if line.strip()]
     for i, line in enumerate(lines):
         head = re.match(r"\s*(?:(\w+):|(P\d)\s)", line)
         name = f"P{i}"
         words = line
         if head is not None:
-            name = (head[1] or head[2]).replace("P_rect_0", "P")
+            stated = head[1] or head[2]
+            met.append(field_name(CALIBRATION, stated))
+            name = stated.replace("P_rect_0", "P")
             words = line[head.end() :]
         if name in rows:
             raise InputError(f"{path}: a second row {name}", "give each camera one row")
         if re.fullmatch(r"P\d", name):
             with parsing(f"{path}, row {name}", ROW_OF_12):
                 rows[name] = np.array(words.split(), np.float64).reshape(3, 4)
-        elif UNUSED.fullmatch(name) is None:
-            unknown.append(name)
-    return rows, [f"calib.txt: unknown rows are not read: {', '.join(unknown)}"] if unknown else []
+    return rows, list(KITTI.notes(met))
 
 
 def _camera(projections: dict[str, F64], name: str, path: Path) -> tuple[F64, F64]:

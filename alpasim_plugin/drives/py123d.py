@@ -8,7 +8,7 @@ the film beside the file. Read are the ego's poses, pinhole cameras and boxes of
 Source: the writers of py123d 0.7.0 (github.com/kesai-labs/py123d).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,6 +19,7 @@ import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import check_regular, parsing
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, BODY_M
 from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
@@ -57,6 +58,28 @@ CLASSES = {
     "PhysicalAIAVBoxDetectionLabel": "cpbtcoyptoob",
     "WODPerceptionBoxDetectionLabel": "ocpoy",
 }
+
+
+PY123D = Fields(
+    "py123d",
+    read={
+        "log": "sync ego_state_se3 box_detections_se3 camera",
+        "sync": "@log_name",
+        "ego_state_se3": """timestamp_us imu_se3 @length @width @height @wheel_base
+            @rear_axle_to_imu_se3 @center_to_imu_se3""",
+        "box_detections_se3": """timestamp_us bounding_box_se3 track_token label
+            @box_detection_label_class""",
+        "camera": """timestamp_us data camera_to_global_se3 @camera_model @intrinsics @distortion
+            @width @height @camera_to_imu_se3 @is_undistorted""",
+    },
+    # Speeds follow from poses; the synchronisation table numbers the rows of the other files.
+    harmless={
+        "sync": "@dataset @split @location @version @map_metadata",
+        "ego_state_se3": "@vehicle_name dynamic_state_se3",
+        "box_detections_se3": "velocity_3d num_lidar_points",
+        "camera": "@camera_name @camera_id",
+    },
+)
 
 
 def read_py123d(folder: Path) -> SourceDrive:
@@ -103,9 +126,7 @@ def read_py123d(folder: Path) -> SourceDrive:
             f"{len(all_photographs) - len(chosen)} photographs after the first of {front} left out"
         )
     actors = _actors(folder, notes) if BOXES in keys else ()
-    unread = [key for key in keys if key not in ("sync", EGO, BOXES) and not key.startswith(CAMERA)]
-    if unread:
-        notes.append(f"not read: {', '.join(unread)}")
+    notes += PY123D.notes(_met(folder, keys))
     with parsing(folder / f"{CAMERA}{front}.arrow", DO_THIS):
         T_front = _T(_modality(folder, CAMERA + front, ())[0]["camera_to_imu_se3"])
     ahead_m, left_m = (inverse(T_imu_axle) @ T_front)[:2, 3].tolist()
@@ -134,6 +155,24 @@ def _modality(
         table.validate(full=True)
         facts = msgpack.unpackb((table.schema.metadata or {})[b"metadata"], strict_map_key=False)
         return facts, [table.column(f"{key}.{name}") for name in columns]
+
+
+def _met(folder: Path, keys: Sequence[str]) -> Iterator[str]:
+    """Yield the names of the fields of a log: its files, and the columns and metadata of those that
+    are read; the columns of ``sync`` are numbers of rows of other files.
+    """
+    for key in keys:
+        holder = "camera" if key.startswith(CAMERA) else key
+        yield field_name("log", holder)
+        if field_name("log", holder) not in PY123D.names():
+            continue
+        path = folder / f"{key}.arrow"
+        with parsing(path, DO_THIS, "no Arrow file of py123d"):
+            schema = pa.ipc.open_file(pa.memory_map(str(path))).schema
+            facts = msgpack.unpackb((schema.metadata or {})[b"metadata"], strict_map_key=False)
+        yield from (field_name(holder, f"@{name}") for name in facts)
+        if key != "sync":
+            yield from (field_name(holder, name.removeprefix(f"{key}.")) for name in schema.names)
 
 
 def _T(pose: Sequence[float]) -> F64:

@@ -17,16 +17,24 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from alpasim_plugin.cli.main import PANELS, load_verb
+from alpasim_plugin.control.can_codec import DBC
+from alpasim_plugin.drives.colmap import COLMAP
+from alpasim_plugin.drives.kitti import KITTI
+from alpasim_plugin.drives.py123d import PY123D
+from alpasim_plugin.gaussians.files.packed import COMPRESSED, SPZ
+from alpasim_plugin.gaussians.files.ply import PLY
 from alpasim_plugin.gaussians.files.sog import SOG
 from alpasim_plugin.gaussians.fit.photographs import TRANSFORMS
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
+from scenarios.argoverse import ARGOVERSE
 from scenarios.commonroad_fields import COMMONROAD
 from scenarios.lanelet2 import LANELET2
 from scenarios.opendrive_fields import OPENDRIVE
 from scenarios.osi_messages import OSI
 from scenarios.schema import models
 from scenarios.schema_parts import Part
+from scenarios.usdz_fields import USDZ
 
 EVERY_VERB = ("--json", "--debug", "--help")
 TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
@@ -150,8 +158,11 @@ def key_tables() -> str:
 
 def field_table() -> str:
     """Return the table of the fields that readers know."""
-    formats = (OPENDRIVE, LANELET2, COMMONROAD, OSI, TRANSFORMS, SOG)
-    head = ("form", "read", "left out without a change")
+    formats = (
+        *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, COLMAP, KITTI, PY123D, ARGOVERSE, USDZ),
+        *(OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC),
+    )
+    head = ("form", "read", "left out without a change", "refused")
     return table(head, [fields.row() for fields in formats])
 
 

@@ -99,3 +99,20 @@ def test_facts_that_cannot_be_are_refused(tmp_path, name, fact):
     with pytest.raises(InputError) as caught:
         read_source(folder)
     assert f"{name}.arrow" in str(caught.value)
+
+
+def test_columns_and_facts_that_are_not_read_are_named(tmp_path, log):
+    folder = shutil.copytree(log, tmp_path / "log")
+    path = folder / "camera.pcam_f0.arrow"
+    table = pa.ipc.open_file(str(path)).read_all()
+    facts = msgpack.unpackb(table.schema.metadata[b"metadata"])
+    packed = msgpack.packb({**facts, "readout_us": 20_000})
+    table = table.append_column("camera.pcam_f0.exposure_us", table.column(0))
+    table = table.replace_schema_metadata({b"metadata": packed})
+    path.unlink()
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(table)
+    notes = str(read_source(folder).notes)
+    for name in ("camera@readout_us", "camera/exposure_us", "log/lidar.lidar_top"):
+        assert f"{name} (1)" in notes
+    assert "camera/data" not in notes

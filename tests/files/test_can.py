@@ -3,10 +3,14 @@
 Every database is made here.
 """
 
+from types import SimpleNamespace
+
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.cli.output import policy_notes
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.parts.resolve import unidentified
 
 pytest.importorskip("cantools", reason="the extra [can] is not installed")
 can = pytest.importorskip("can")
@@ -158,3 +162,21 @@ def test_what_cannot_be_sent_is_refused_when_the_map_is_opened(tmp_path, parts, 
     policy = f"can://virtual:files?map={tmp_path / 'map.yaml'}"
     command = ["--renderer", "clean", "--policy", policy, "--dry-run", "smoke/straight"]
     assert run_command([*command, "--out", str(tmp_path / "out")]) == 2
+
+
+PROTECTED = """BA_DEF_ BO_ "E2EDataID" INT 0 65535;
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "E2EDataID" 0;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "E2EDataID" BO_ 257 12;
+BA_ "GenMsgCycleTime" BO_ 257 10;
+"""
+
+
+def test_attributes_of_a_database_that_are_not_read_are_named_in_the_run(tmp_path):
+    codec, path = opened(tmp_path, EGO, CMD, PROTECTED)
+    note = "CAN database: not read are message@E2EDataID (1)"
+    assert codec.notes == (note,)
+    name = f"can://virtual:files?map={path}"
+    plan = SimpleNamespace(policies=(unidentified("policy", name),))
+    assert policy_notes(plan) == [f"{name}: {note}"]

@@ -406,7 +406,7 @@ SIDE = np.eye(4)
 SIDE[:3] = [[0, 0, -1, 0], [0, 1, 0, 0.1], [1, 0, 0, -0.3]]  # from the front camera to the left one
 
 
-def rig(model, folders, left, binary=False, turn=1.0):
+def rig(model, folders, left, binary=False, shift=0.0):
     """Write a rig of two cameras, 7 ahead and 9 to the left, which has images of some frames only;
     frames and images are numbered against their order.
     """
@@ -431,7 +431,7 @@ def rig(model, folders, left, binary=False, turn=1.0):
             data = f"2 CAMERA 9 {side} CAMERA 7 {ahead}"
         frames.append(f"{50 - i} 3 {numbers(T_rig_world)} {data}")
     mount = SIDE.copy()
-    mount[0, 2] *= turn
+    mount[0, 3] += shift
     (model / "images.txt").write_text("\n\n".join(images) + "\n")
     (model / "rigs.txt").write_text(f"# rigs\n3 2 CAMERA 7 CAMERA 9 1 {numbers(mount)}\n")
     (model / "frames.txt").write_text("# frames\n" + "\n".join(frames[::-1]) + "\n")
@@ -481,11 +481,37 @@ def test_images_of_a_frame_of_a_rig_have_one_time(tmp_path, folders, binary):
     assert np.allclose(mount, np.linalg.inv(SIDE), atol=1e-9)
 
 
+@pytest.mark.parametrize("binary", [False, True])
+def test_images_that_do_not_stand_where_their_rig_says_are_refused(tmp_path, binary):
+    rig(tmp_path / "sparse/0", ["front/", "left/"], [0, 1], binary, shift=0.2)
+    with pytest.raises(InputError, match=r"its pose is 0\.2 units"):
+        read_source(tmp_path, need_files=False)
+
+
+def test_numbers_behind_the_last_one_of_a_line_of_colmap_are_refused(tmp_path):
+    model = tmp_path / "sparse/0"
+    colmap(model, NAMES)
+    cameras = model / "cameras.txt"
+    cameras.write_text(cameras.read_text().rstrip() + " 0.01\n")  # a lens of one number more
+    with pytest.raises(InputError, match="goes on with"):
+        read_source(tmp_path, need_files=False)
+
+
+def test_bytes_behind_the_last_record_of_colmap_are_refused(tmp_path):
+    model = rig(tmp_path / "sparse/0", ["front/", "left/"], [0, 1], binary=True)
+    with (model / "cameras.bin").open("ab") as file:
+        file.write(b"more")
+    with pytest.raises(InputError, match="4 bytes after the last record"):
+        read_source(tmp_path, need_files=False)
+
+
 def test_rigs_of_one_camera_change_nothing(tmp_path):
     model = tmp_path / "sparse/0"
     colmap(model, NAMES)
     (model / "rigs.txt").write_text("1 1 CAMERA 7\n")
-    (model / "frames.txt").write_text("4 1 1 0 0 0 0 0 0 1 CAMERA 7 1\n")
+    first_image = (model / "images.txt").read_text().splitlines()[1]
+    pose = " ".join(first_image.split()[1:8])
+    (model / "frames.txt").write_text(f"4 1 {pose} 1 CAMERA 7 1\n")
     assert along(read_source(tmp_path, need_files=False)) == STRAIGHT
 
 
@@ -525,3 +551,41 @@ def test_text_of_windows_is_read(tmp_path):
     file.write_text(file.read_text().replace("images/", r".\\images\\"))
     first = read_source(folder, need_files=False).photographs[0].file
     assert first == folder / "images/0.png"
+
+
+def test_files_and_rows_that_no_reader_of_kitti_knows_are_named(tmp_path):
+    folder = kitti(tmp_path / "a", row("P2", 180) + "Tr: 1 0 0\nT_cam_gps: 1 2 3\n")
+    (folder / "oxts").mkdir()
+    (folder / "velodyne").mkdir()
+    notes = str(read_source(folder).notes)
+    assert "KITTI odometry: not read are calib.txt/T_cam_gps (1)" in notes
+    assert "folder/oxts (1)" in notes
+    assert "velodyne" not in notes
+
+
+def test_files_of_a_colmap_model_that_are_not_read_are_named(tmp_path):
+    colmap(tmp_path / "sparse/0", NAMES)
+    (tmp_path / "sparse/0/pose_priors.txt").write_text("")
+    (notes,) = [n for n in read_source(tmp_path, need_files=False).notes if "COLMAP" in n]
+    assert notes == "COLMAP: not read are model/pose_priors (1)"
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("rolling_shutter", [0, 0, 1, 0]),
+        ("normal_mts_args", ["--scene"]),
+        ("ftheta_p0", 0.1),
+        ("equirectangular", True),
+        ("n_frames", 5),
+    ],
+)
+def test_keys_of_transforms_by_which_cameras_differ_are_refused(tmp_path, key, value):
+    folder = transforms(tmp_path / "a", NAMES, **{key: value})
+    with pytest.raises(InputError, match=f"frame/{key}"):
+        read_source(folder, need_files=False)
+
+
+def test_a_shutter_of_no_duration_changes_nothing(tmp_path):
+    folder = transforms(tmp_path / "a", NAMES, rolling_shutter=[0.0, 0.0, 0.0, 0.0])
+    assert along(read_source(folder, need_files=False)) == STRAIGHT

@@ -224,17 +224,18 @@ def test_keys_of_sog_are_known_noted_or_refused(tmp_path):
 # --- SPZ
 
 
-def write_spz(path, version, flags, extensions=b""):
-    """Write six Gaussians of degree 2 with flags and extensions in the header's places."""
+def write_spz(path, version, flags, extensions=b"", reserved=0):
+    """Write six Gaussians of degree 2 with flags, extensions and a number in a reserved place."""
     plain_spz(path, version, 6, 2, body_streams(version, 6, 2))
     data = path.read_bytes()
     if version == 4:
         table = 32 + len(extensions)
-        head = data[:14] + bytes([flags, data[15]]) + struct.pack("<I12x", table)
+        head = data[:14] + bytes([flags, data[15]]) + struct.pack("<IB11x", table, reserved)
         path.write_bytes(head + extensions + data[32:])
     else:
         body = gzip.decompress(data)
-        path.write_bytes(gzip.compress(body[:14] + bytes([flags]) + body[15:] + extensions))
+        body = body[:14] + bytes([flags, reserved]) + body[16:] + extensions
+        path.write_bytes(gzip.compress(body))
     return path
 
 
@@ -309,7 +310,7 @@ def test_flags_and_extensions_of_an_spz(tmp_path, version):
     assert not opened(write_spz(path, version, 0))[1].notes
     assert not opened(write_spz(path, version, 2, record(0xADBE0002, 0, 0, 0)))[1].notes
     for flags, extensions, found in (
-        (4, b"", "0x04"),
+        (4, b"", "flags/bit_2"),
         (2, record(0xADBE0001, 1), "0xadbe0001"),
         (2, record(0xADBE0003, 99), "damaged"),
         (2, record(0xADBE0003, 6)[:-3], "damaged"),
@@ -329,3 +330,51 @@ def test_what_mesh_and_point_editors_write_is_read(tmp_path):
     cloud, report = opened(file)
     assert np.array_equal(cloud.scales, plain.scales)
     assert not report.notes
+
+
+def with_bound(path, name):
+    """Write a compressed PLY whose chunks have one more number."""
+    write_compressed(path, 3, 1, (0, 0, 0, 0))
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    head = head.replace(b"element vertex", f"property float {name}\nelement vertex".encode())
+    rows = body[: 4 * 12] + struct.pack("<f", 2.0) + body[4 * 12 :]
+    path.write_bytes(head + b"end_header\n" + rows)
+    return path
+
+
+def with_keys(folder, **keys):
+    """Write a SOG with more keys in its document, or in those of its planes."""
+    write_sog(folder)
+    meta = json.loads((folder / "meta.json").read_text())
+    for name, value in keys.items():
+        meta[name] = {**meta[name], **value} if isinstance(meta.get(name), dict) else value
+    (folder / "meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (lambda path: with_bound(path, "min_w"), "chunk/min_w"),
+        (lambda path: write_spz(path, 3, 0, reserved=1), "header/reserved"),
+        (lambda path: write_spz(path, 4, 0, reserved=1), "header/reserved"),
+        (lambda path: with_keys(path, means={"unit": "mm"}), "means/unit"),
+        (lambda path: with_keys(path, shN={"palette_size": 64}), "shN/palette_size"),
+        (lambda path: with_keys(path, up=[0, 0, 1]), "meta.json/up"),
+    ],
+)
+def test_a_field_that_a_reader_of_models_does_not_know_is_refused_by_name(tmp_path, write, name):
+    with pytest.raises(InputError, match=name):
+        opened(write(tmp_path / "model"))
+
+
+def test_the_size_of_planes_that_lichtfeld_studio_states_changes_nothing(tmp_path):
+    plain, _ = opened(with_keys(tmp_path / "a"))
+    cloud, report = opened(with_keys(tmp_path / "b", width=10, height=10))
+    assert np.array_equal(cloud.means, plain.means)
+    assert not report.notes
+
+
+def test_bytes_behind_an_spz_that_its_header_does_not_announce_are_said(tmp_path):
+    _, report = opened(write_spz(tmp_path / "a.spz", 3, 0, record(0xADBE0003, 6)))
+    assert "12 bytes" in str(report.notes)

@@ -149,3 +149,14 @@ def test_rows_of_the_ego_are_no_actor(tmp_path):
     assert [
         a.actor_id for a in read_argoverse(write_argoverse(tmp_path / "x", annotations=rows)).actors
     ] == ["parked", "walker"]
+
+
+def test_what_is_not_read_of_a_log_is_named(tmp_path):
+    vector = vector_map()
+    vector["lane_segments"]["1"]["speed_limit_mph"] = 25
+    vector["traffic_lights"] = {}
+    folder = write_argoverse(tmp_path / "x", document=vector)
+    (folder / "odometry.feather").write_bytes(b"")
+    notes = str(read_argoverse(folder).notes)
+    for name in ("lane_segment/speed_limit_mph", "map/traffic_lights", "log/odometry.feather"):
+        assert f"{name} (1)" in notes

@@ -250,3 +250,34 @@ def test_a_segment_of_exactly_two_metres_is_split_as_in_alpasims_loader(tmp_path
         write(tmp_path / "a.usdz", changed(clipgt__lane_dot_parquet=parquet(rows)))
     )
     assert len(scene.lane_map.lanes["L"].centre) == 121
+
+
+def test_what_is_not_read_of_a_scene_is_named(tmp_path):
+    assert "not read are" not in str(read_usdz(write(tmp_path / "a.usdz")).notes)
+    lanes = [
+        {"key": key("L0"), "lane": {"left_rail": rail(1.8), "right_rail": rail(-1.8), "speed": 9.0}}
+    ]
+    drive = rig()
+    drive["rig_trajectories"][0]["T_rig_worlds_smoothed"] = []
+    content = changed(
+        clipgt__lane_dot_parquet=parquet(lanes),
+        clipgt__crosswalk_dot_parquet=parquet([{"key": key("c")}]),
+        rig_trajectories_dot_json=json.dumps(drive).encode(),
+        mesh_ground_dot_ply=b"ply",
+    )
+    notes = str(read_usdz(write(tmp_path / "b.usdz", content)).notes)
+    for name in (
+        "lane/speed",
+        "tables/crosswalk",
+        "rig_trajectory/T_rig_worlds_smoothed",
+        "archive/mesh_ground.ply",
+    ):
+        assert f"{name} (1)" in notes
+
+
+def test_a_body_that_is_turned_against_the_rig_is_refused(tmp_path):
+    drive = rig()
+    drive["rig_trajectories"][0]["rig_bbox"]["rot"] = [0.0, 0.0, 0.1]
+    content = changed(rig_trajectories_dot_json=json.dumps(drive).encode())
+    with pytest.raises(InputError, match="turned against the rig"):
+        read_usdz(write(tmp_path / "a.usdz", content))

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_bytes
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import GAUSSIANS
-from alpasim_plugin.core.files.reading import parsing, some_of, unzstd
+from alpasim_plugin.core.files.reading import parsing, unzstd
 from alpasim_plugin.core.geometry import quat_from_matrix
 from alpasim_plugin.core.types import F64, I64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays, quat_multiply
@@ -34,7 +35,29 @@ from alpasim_plugin.gaussians.sh import C0, SH_SIZES, rotate_sh
 
 CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = ("x", "y", "z", "scale_x", "scale_y", "scale_z")
 _MAX_LOG_SCALE = 20.0
+COMPRESSED = Fields(
+    "compressed PLY",
+    read={
+        "file": "chunk vertex sh",
+        "chunk": " ".join(f"{end}_{name}" for end in ("min", "max") for name in (*_BOUNDS, *"rgb")),
+        "vertex": " ".join(_PACKED),
+        "sh": "f_rest_#",
+    },
+    harmless={},
+    others="refused",
+)
+SPZ = Fields(
+    "SPZ",
+    read={
+        "header": "magic version count sh_degree fractional_bits flags streams table",
+        "flags": "antialiased extended",
+        "extensions": "coordinate_system",
+    },
+    harmless={"extensions": "safe_orbit_camera"},
+    others="refused",
+)
 
 
 def is_compressed_ply(header: PlyHeader) -> bool:
@@ -137,21 +160,12 @@ def _read_sh(header: PlyHeader, n: int) -> F64:
 
 def _check(header: PlyHeader, chunks: NDArray[np.void], rows: NDArray[np.void]) -> None:
     missing = [name for name in _PACKED if name not in (rows.dtype.names or ())]
-    bounds = [
-        f"{end}_{name}"
-        for end in ("min", "max")
-        for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")
-    ]
+    bounds = [f"{end}_{name}" for end in ("min", "max") for name in _BOUNDS]
     missing += [name for name in bounds if name not in (chunks.dtype.names or ())]
-    unknown = sorted(
-        {element.name for element in header.elements} - {"chunk", "vertex", "sh"}
-        | set(rows.dtype.names or ()) - set(_PACKED)
-    )
-    if unknown:
-        raise InputError(
-            f"{header.path}: {some_of(unknown)}: parts that may change what is drawn",
-            "export a plain compressed PLY (SuperSplat, gsplat)",
-        )
+    met = [field_name("file", element.name) for element in header.elements]
+    for element in header.elements:
+        met += [field_name(element.name, name) for name in element.properties]
+    COMPRESSED.check(met, header.path, "export a plain compressed PLY (SuperSplat, gsplat)")
     need = -(-len(rows) // CHUNK)
     if missing or len(chunks) < need:
         problem = (
@@ -200,8 +214,9 @@ _EXPORT_AGAIN = "copy or export the file again"
 # Flags of a header
 ANTIALIASED = 1
 EXTENDED = 2
-ORBIT = 0xADBE0002  # extensions: limits of a viewer's camera
-AXES = 0xADBE0003  # where axes point
+FLAGS = {ANTIALIASED: "antialiased", EXTENDED: "extended"}
+AXES = 0xADBE0003  # the extension that states where axes point
+EXTENSIONS = {0xADBE0002: "safe_orbit_camera", AXES: "coordinate_system"}
 MOST_EXTENDED = 1 << 16  # bytes of extensions
 # Axes by the number in the extension: where x, y and z point.
 SYSTEMS = (
@@ -281,10 +296,14 @@ def read_spz(path: Path | str) -> GaussianArrays:
             body[end - size : end] for size, end in zip(header.stream_bytes, ends, strict=True)
         ]
         extensions = data[16 + sum(header.stream_bytes) :]
-    system = _stated_axes(path, extensions) if header.flags & EXTENDED else SYSTEMS[0]
+    system = SYSTEMS[0]
     notes: tuple[str, ...] = ()
+    if header.flags & EXTENDED:
+        system = _stated_axes(path, extensions)
+    elif len(extensions):
+        notes += (f"{len(extensions)} bytes that the header does not announce are not read",)
     if system != SYSTEMS[0]:
-        notes = (f"axes {system} as the file states them, turned into those of a PLY",)
+        notes += (f"axes {system} as the file states them, turned into those of a PLY",)
     arrays = in_ply_axes(_decode(header, streams), system)
     antialias_px2 = EPS2D_PX2 if header.flags & ANTIALIASED else 0.0
     return arrays._replace(notes=notes, antialias_px2=antialias_px2)
@@ -305,8 +324,8 @@ def _stated_axes(path: Path, data: bytes) -> str:
                 f"axes {system}, which the library of SPZ and the letters take for two different ones",
                 "export it with axes RUB or RDF",
             )
-        if kind not in (AXES, ORBIT):
-            raise _failure(path, f"extension {kind:#010x} of unknown meaning", "export it without")
+        name = EXTENSIONS.get(kind, f"{kind:#010x}")
+        SPZ.check([field_name("extensions", name)], path, "export it without this extension")
         offset += 8 + size
     return system
 
@@ -382,7 +401,7 @@ def _decode(header: SpzHeader, streams: list[U8]) -> GaussianArrays:
 def _parse_header(path: Path, data: bytes) -> SpzHeader:
     if len(data) < 16:
         raise _failure(path, f"{len(data)} bytes, shorter than any header", _EXPORT_AGAIN)
-    magic, version, count, degree, bits, flags, _ = struct.unpack_from("<IIIBBBB", data)
+    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
     if magic != MAGIC:
         raise _failure(path, f"magic {data[:4]!r}, expected b'NGSP'", "give an SPZ file")
     if version not in (2, 3, 4):
@@ -396,8 +415,11 @@ def _parse_header(path: Path, data: bytes) -> SpzHeader:
         raise _failure(
             path, f"{count} Gaussians of degree {degree} with {bits} fractional bits", _EXPORT_AGAIN
         )
-    if flags & ~(ANTIALIASED | EXTENDED):
-        raise _failure(path, f"flags {flags:#04x} of unknown meaning", "export it without them")
+    flag_names = (FLAGS.get(1 << bit, f"bit_{bit}") for bit in range(8) if flags >> bit & 1)
+    met = [field_name("flags", name) for name in flag_names]
+    if any(data[20:32]) if version == 4 else reserved:
+        met.append(field_name("header", "reserved"))
+    SPZ.check(met, path, "export it without them")
     return SpzHeader(version, count, degree, bits, flags)
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.atomic import atomic_file, write_bytes
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import GAUSSIANS
 from alpasim_plugin.core.files.reading import open_regular, parsing, read_bytes, some_of
 from alpasim_plugin.core.types import F64, U8, FloatArray
@@ -38,17 +39,30 @@ _REQUIRED = (
     *("scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 COLOURS = ("red", "green", "blue")
-# What other tools write beside it and nothing is drawn of: normals, colours of points, and features
-# by which Gaussians are grouped.
-_HARMLESS = re.compile(
-    r"n[xyz]|red|green|blue|id|ins_feat_[rgb]2?|(obj_dc|ins_feat|semantic|language|language_feature)_\d+"
-    r"|(semantic|label|class|object|instance|segment)(_id)?"
+VERTEX = "vertex"  # holds the properties of a Gaussian, whatever the element's name
+ELEMENT = "file"  # holds elements
+PLY = Fields(
+    "3DGS PLY",
+    read={
+        ELEMENT: "vertex color_space",
+        VERTEX: """x y z f_dc_# f_rest_# opacity scale_# rot_# filter_3D filter_3d transform state
+            motion_# omega_#""",
+    },
+    # Normals, colours of points, features by which Gaussians are grouped, and the training camera
+    # of a model, as Apple's SHARP writes it.
+    harmless={
+        ELEMENT: "extrinsic intrinsic image_size frame disparity version",
+        VERTEX: """nx ny nz red green blue id ins_feat_r ins_feat_g ins_feat_b ins_feat_r2 ins_feat_g2
+            ins_feat_b2 obj_dc_# ins_feat_# semantic_# language_# language_feature_# semantic
+            semantic_id label label_id class class_id object object_id instance instance_id segment
+            segment_id""",
+    },
+    others="refused",
 )
 # Properties that change nothing where they have one value in every row: SuperSplat's number of a
 # transform and its marks of hidden Gaussians, and motions.
 _NEUTRAL = {"transform": 0.0, "state": 0.0, "motion": 0.0, "omega": 0.0}
-# Elements beside a model: its training camera, as Apple's SHARP writes it.
-_BESIDE = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "version", "color_space"}
+PLAIN = "export a plain 3DGS model, with colours in sRGB"
 _FLAT = 1e-3  # thickness of a 2D Gaussian, in its smaller scale
 # Comments that state how a model is to be drawn or how its axes lie.
 _STATED = re.compile(r"ax[ie]s|coordinate|handed|unit|scale|antialias|rendermode|frame", re.I)
@@ -83,15 +97,11 @@ def read_ply_arrays(path: Path | str, element: str | None = None) -> GaussianArr
     header = read_ply_header(path)
     chosen = header.element(element) if element is not None else _only_gaussian_element(header)
     n_rest, unsure = _check_properties(header, chosen)
-    for beside in header.elements:  # refuse what may change what is drawn
-        linear = beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]
-        is_harmless = beside.name.startswith("vertex") or beside.name in _BESIDE
-        if linear or (beside.count and not is_harmless):
-            problem = "linear colours" if linear else f"{beside.count} rows of unknown meaning"
-            raise InputError(
-                f"{header.path}, element {beside.name!r}: {problem}",
-                "export a plain 3DGS model, with colours in sRGB",
-            )
+    for beside in header.elements:
+        if beside.name == "color_space" and read_ply_element(header, beside.name)[0][0]:
+            raise InputError(f"{header.path}, element 'color_space': linear colours", PLAIN)
+        if beside.count and not beside.name.startswith("vertex"):
+            PLY.check([field_name(ELEMENT, beside.name)], header.path, PLAIN)
     rows = read_ply_element(header, chosen.name)
     notes = stated_in(header)
     if unsure:
@@ -252,24 +262,25 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> tuple[int, list
     must have their neutral value.
     """
     have = set(element.properties)
+    usual = {*_REQUIRED, *_SCALES}
     missing = [name for name in _REQUIRED if name not in have]
     if missing:
         raise InputError(
             f"{header.path}, element {element.name!r}: missing properties {missing}",
             "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
-    usual_properties = {*_REQUIRED, *_SCALES, "filter_3D", "filter_3d"}
-    strange = sorted(
-        name
-        for name in have - usual_properties
-        if not name.startswith("f_rest_") and _HARMLESS.fullmatch(name) is None
+    PLY.check(
+        [field_name(VERTEX, name) for name in have],
+        f"{header.path}, element {element.name!r}",
+        "export a plain 3DGS model, of one time and without filters; or leave the properties out if nothing is drawn of them",
     )
-    unknown = [name for name in strange if _neutral_of(name) is None]
-    if unknown:
+    stray = sorted({name for name in have if re.fullmatch(r"(scale|rot|f_dc)_\d+", name)} - usual)
+    if stray:
         raise InputError(
-            f"{header.path}, element {element.name!r}: properties that may change what is drawn: {some_of(unknown)}",
-            "export a plain 3DGS model, of one time and without filters; or leave the properties out if nothing is drawn of them",
+            f"{header.path}, element {element.name!r}: more numbers than a Gaussian has: {some_of(stray)}",
+            PLAIN,
         )
+    strange = sorted(name for name in have if _neutral_of(name) is not None)
     fields = element.dtype or np.dtype([])
     whole = [name for name in ("opacity", *_SCALES) if name in have and fields[name].kind != "f"]
     if whole:

@@ -21,7 +21,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, read_bytes
 from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
-from alpasim_plugin.core.files.reading import as_shape, parsing, some_of
+from alpasim_plugin.core.files.reading import as_shape, parsing
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.constants import EPS2D_PX2
@@ -58,11 +58,21 @@ class _Meta(TypedDict):
     sh0: _Plane
 
 
-# What is not listed may change what is drawn, and is refused.
 SOG = Fields(
     "SOG",
-    read={META: " ".join((*_Meta.__annotations__, "shN", "antialias", "model"))},
-    harmless={META: "asset"},
+    read={
+        META: " ".join((*_Meta.__annotations__, "shN", "antialias", "model")),
+        "means": "mins maxs files",
+        "scales": "codebook files",
+        "quats": "files",
+        "sh0": "codebook files",
+        "shN": "count bands codebook files",
+    },
+    harmless={META: "asset width height"},
+    # LichtFeld Studio names the size of its palette so, and has written the harmonics in an order
+    # that neither its own reader nor any other one expects.
+    moving={"shN": "palette_size coeffs"},
+    others="refused",
 )
 
 
@@ -102,12 +112,11 @@ def _read(get: Get, location: Path) -> GaussianArrays:
     meta = as_shape(_Meta, document, location, DO_THIS)
     if meta["version"] != 2:
         raise InputError(f"{location}: version {meta['version']}", DO_THIS)
-    known_fields = SOG.names() | SOG.names(harmless=True)
-    unknown = sorted(key for key in document if field_name(META, key) not in known_fields)
-    if unknown:
-        raise InputError(
-            f"{location}: keys that may change what is drawn: {some_of(unknown)}", DO_THIS
-        )
+    met = [field_name(META, key) for key in document]
+    planes = {key: part for key, part in document.items() if isinstance(part, dict)}
+    for plane_name in planes.keys() - {"asset"}:
+        met += [field_name(plane_name, key) for key in planes[plane_name]]
+    SOG.check(met, location, DO_THIS)
     model = document.get("model", "default")
     if model not in ("default", "antialiased", "2dgs"):
         raise InputError(f"{location}: a model {model!r}", DO_THIS)

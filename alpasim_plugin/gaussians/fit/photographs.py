@@ -30,7 +30,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_bytes, read_json_object
-from alpasim_plugin.core.files.fields import Fields
+from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.images import check_image, decode_image, image_fault
 from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.files.reading import as_shape
@@ -72,7 +72,15 @@ TRANSFORMS = Fields(
         "frame": """exposure aabb_scale scale offset render_aabb up sharpness colmap_im_id applied_transform
             applied_scale orientation_override auto_scale_poses_override train_filenames
             val_filenames test_filenames depth_unit_scale_factor integer_depth_scale
-            enable_depth_loading n_extra_learnable_dims white_transparent black_transparent"""
+            enable_depth_loading enable_ray_loading n_extra_learnable_dims white_transparent
+            black_transparent aabb sharpen importance_sampling fix_premult envmap depth_path
+            depth_file_path sharpness_discard_threshold"""
+    },
+    # By these Instant-NGP takes other axes, other lenses, other frames, and cameras that move
+    # during an exposure.
+    moving={
+        "frame": """normal_mts_args ftheta_p# latlong equirectangular n_frames rolling_shutter
+            transform_matrix_start transform_matrix_end"""
     },
 )
 WHOLE = "give a whole PNG or JPEG in grey or RGB"
@@ -170,6 +178,9 @@ def read_posed_photographs(
     )
     listed = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
     frames = [{**document, **frame} for frame in listed]
+    stated = ((key, value) for frame in frames for key, value in frame.items())
+    met = [field_name("frame", key) for key, value in stated if np.any(value)]
+    TRANSFORMS.check(met, path, "write the poses as they are, without this key")
     meant = document.get("axes", axes)
     if not isinstance(meant, str) or meant not in AXES:
         raise InputError(
