@@ -63,7 +63,9 @@ def debug_row(debug: Mapping[str, Any]) -> dict[str, list[list[Any]]]:
 
 def kind_of(name: str, value: Any) -> str:
     """Return as what a value is shown: the first of `KINDS` that fits, else ``text``."""
-    array = np.asarray(value) if isinstance(value, np.ndarray | list | tuple) else np.empty(0)
+    if not isinstance(value, np.ndarray | list | tuple):
+        return "text"
+    array = np.asarray(value)
     if array.dtype.kind in "fiub" and array.size > 0 and np.isfinite(array).any():
         for kind, prefix, dtype, least, last in KINDS:
             if (

@@ -5,6 +5,7 @@ must use a local origin. Times are integer microseconds in 64 bits and exact.
 """
 
 import hashlib
+import math
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.log.images import ImageEncoding
+from alpasim_plugin.log.packed_poses import packed_trajectories
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
 DIGEST_BITS = 58
@@ -124,6 +126,17 @@ def wire_poses(xyz: F64, quat: F64, name: str) -> list[common_pb2.Pose]:
         InputError: A value is not finite, a quaternion is zero, or a coordinate is too large for
             float32.
     """
+    unit_quat = _checked_quats(xyz, quat, name)
+    vec = common_pb2.Vec3
+    rotation = common_pb2.Quat
+    return [
+        common_pb2.Pose(vec=vec(x=x, y=y, z=z), quat=rotation(w=w, x=qx, y=qy, z=qz))
+        for (x, y, z), (w, qx, qy, qz) in zip(xyz.tolist(), unit_quat.tolist(), strict=True)
+    ]
+
+
+def _checked_quats(xyz: F64, quat: F64, name: str) -> F64:
+    """Return quaternions ``(N, 4)`` of length 1, or refuse poses; see `wire_poses`."""
     norm = np.linalg.norm(quat, axis=-1, keepdims=True)
     near, long = np.abs(xyz) < MAX_LOCAL_M, (norm > 0) & (norm < np.inf)  # neither is true of NaN
     if not (near.all() and long.all()):
@@ -132,29 +145,42 @@ def wire_poses(xyz: F64, quat: F64, name: str) -> list[common_pb2.Pose]:
             f"{name}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
-    vec = common_pb2.Vec3
-    rotation = common_pb2.Quat
-    return [
-        common_pb2.Pose(vec=vec(x=x, y=y, z=z), quat=rotation(w=w, x=qx, y=qy, z=qz))
-        for (x, y, z), (w, qx, qy, qz) in zip(xyz.tolist(), (quat / norm).tolist(), strict=True)
-    ]
+    return np.asarray(quat / norm, np.float64)
 
 
 def wire_pose(transform: F64, name: str) -> common_pb2.Pose:
-    """Return the message of one ``(4, 4)`` transform; see `wire_poses`."""
-    return wire_poses(transform[None, :3, 3], quat_from_matrix(transform[None, :3, :3]), name)[0]
+    """Return the message of one ``(4, 4)`` transform; see `wire_poses`, whose arithmetic it does
+    without arrays.
+    """
+    x, y, z = transform[:3, 3].tolist()
+    quat = quat_from_matrix(transform[:3, :3])
+    w, qx, qy, qz = quat.tolist()
+    norm = math.sqrt(w * w + qx * qx + qy * qy + qz * qz)
+    is_near = abs(x) < MAX_LOCAL_M and abs(y) < MAX_LOCAL_M and abs(z) < MAX_LOCAL_M
+    if not (is_near and 0.0 < norm < math.inf):  # neither is true of NaN
+        return wire_poses(transform[None, :3, 3], quat[None], name)[0]  # which says what is wrong
+    return common_pb2.Pose(
+        vec=common_pb2.Vec3(x=x, y=y, z=z),
+        quat=common_pb2.Quat(w=w / norm, x=qx / norm, y=qy / norm, z=qz / norm),
+    )
 
 
 def wire_trajectory(trajectory: Trajectory, name: str) -> common_pb2.Trajectory:
     """Return the message of a trajectory; see `wire_poses`."""
-    poses = wire_poses(trajectory.xyz, trajectory.quat, name)
-    at_time = common_pb2.PoseAtTime
-    return common_pb2.Trajectory(
-        poses=[
-            at_time(pose=pose, timestamp_us=t_us)
-            for pose, t_us in zip(poses, trajectory.t_us.tolist(), strict=True)
-        ]
-    )
+    return common_pb2.Trajectory.FromString(trajectory_bytes([trajectory], name)[0])
+
+
+def trajectory_bytes(trajectories: Sequence[Trajectory], name: str) -> list[bytes]:
+    """Return the serialised messages of trajectories; see `wire_poses`.
+
+    A message of the log takes them by ``MergeFromString`` where they belong: one that is given to a
+    constructor is copied.
+    """
+    xyz = np.concatenate([trajectory.xyz for trajectory in trajectories])
+    quat = np.concatenate([trajectory.quat for trajectory in trajectories])
+    t_us = np.concatenate([trajectory.t_us for trajectory in trajectories])
+    lengths = [len(trajectory) for trajectory in trajectories]
+    return packed_trajectories(xyz, _checked_quats(xyz, quat, name), t_us, lengths)
 
 
 def wire_dynamics(state: EgoState) -> common_pb2.DynamicState:

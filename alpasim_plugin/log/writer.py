@@ -23,6 +23,7 @@ from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.schema import (
     EGO,
     RolloutHeader,
+    trajectory_bytes,
     wire_box,
     wire_camera,
     wire_dynamics,
@@ -203,16 +204,14 @@ class AslWriter:
                 the driver gave none.
             samples: Alternatives it considered, the same way; they feed minADE.
         """
-        first, *others = (
-            wire_trajectory(trajectory, "the driver's plan and its samples")
-            for trajectory in (plan, *samples)
-        )
-        message = egodriver_pb2.DriveResponse
-        self._write(
-            driver_return=message(
-                trajectory=first, debug_info=message.DebugInfo(sampled_trajectories=others)
-            )
-        )
+        entry = logging_pb2.LogEntry()
+        response = entry.driver_return
+        first, *others = trajectory_bytes([plan, *samples], "the driver's plan and its samples")
+        response.trajectory.MergeFromString(first)
+        response.debug_info.SetInParent()
+        for other in others:
+            response.debug_info.sampled_trajectories.add().MergeFromString(other)
+        self._file.write(entry)
 
     def controller_request(
         self, state: EgoState, plan: Trajectory, to_us: int, forced: bool = False
@@ -229,7 +228,7 @@ class AslWriter:
         if len(plan):
             poses = se3(plan.xyz, plan.quat)
             plan = trajectory_from_poses(plan.t_us, inverse(poses[0]) @ poses)
-        self._write(
+        entry = logging_pb2.LogEntry(
             controller_request=controller_pb2.RunControllerAndVehicleModelRequest(
                 session_uuid=self._uuid,
                 state=common_pb2.StateAtTime(
@@ -237,12 +236,14 @@ class AslWriter:
                     pose=wire_pose(state.T_world_rig, "ego state"),
                     state=wire_dynamics(state),
                 ),
-                planned_trajectory_in_rig=wire_trajectory(plan, "the active plan"),
                 future_time_us=to_us,
                 coerce_dynamic_state=forced,
                 pose_reporting_interval_us=self.header.control_us,
             )
         )
+        packed = trajectory_bytes([plan], "the active plan")[0]
+        entry.controller_request.planned_trajectory_in_rig.MergeFromString(packed)
+        self._file.write(entry)
 
     def controller_return(self, state: EgoState) -> None:
         """Write the state the vehicle model reached; estimated equals true, as no pose error is

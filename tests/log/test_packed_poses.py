@@ -1,0 +1,70 @@
+"""Trajectories that are serialised by array operations are those of protobuf's own objects, byte
+by byte.
+"""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import quat_from_matrix, rigid
+from alpasim_plugin.core.types import Trajectory
+from alpasim_plugin.log.schema import trajectory_bytes, wire_pose, wire_poses, wire_trajectory
+from alpasim_plugin.log.wire import common_pb2
+
+
+def trajectory(length, seed=0):
+    rng = np.random.default_rng(seed)
+    t_us = 1_689_697_803_493_732 + np.cumsum(rng.integers(1, 200_000, length))
+    return Trajectory(
+        t_us, 1e3 * rng.standard_normal((length, 3)), rng.standard_normal((length, 4))
+    )
+
+
+def built_one_by_one(one):
+    """Return the message as its objects are put together, the reference."""
+    poses = wire_poses(one.xyz, one.quat, "a trajectory")
+    at_time = common_pb2.PoseAtTime
+    times = one.t_us.tolist()
+    return common_pb2.Trajectory(
+        poses=[at_time(pose=p, timestamp_us=t) for p, t in zip(poses, times, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 65])
+def test_a_trajectory_has_the_bytes_of_its_objects(length):
+    one = trajectory(length)
+    built = built_one_by_one(one)
+    assert wire_trajectory(one, "a trajectory") == built
+    assert wire_trajectory(one, "a trajectory").SerializeToString() == built.SerializeToString()
+
+
+def test_zeros_of_both_signs_have_the_bytes_of_objects():
+    xyz = np.array([[0.0, -0.0, 1.0], [-0.0, 0.0, 0.0]])
+    one = Trajectory(np.array([0, 1]), xyz, np.array([[1.0, 0, 0, 0], [-0.0, 0, 0, 2.0]]))
+    built = built_one_by_one(one).SerializeToString()
+    assert wire_trajectory(one, "zeros").SerializeToString() == built
+
+
+def test_several_trajectories_are_cut_where_each_ends():
+    several = [trajectory(n, seed=n) for n in (3, 0, 7, 1)]
+    messages = [
+        common_pb2.Trajectory.FromString(data) for data in trajectory_bytes(several, "some")
+    ]
+    assert messages == [built_one_by_one(one) for one in several]
+
+
+def test_a_pose_that_cannot_be_stored_is_named_by_its_place_among_all():
+    usual = trajectory(4)
+    xyz = usual.xyz.copy()
+    xyz[2, 1] = np.nan
+    late = Trajectory(usual.t_us, xyz, usual.quat)
+    with pytest.raises(InputError, match="pose 7: position"):
+        trajectory_bytes([trajectory(5), late], "plans")
+
+
+def test_one_pose_has_the_numbers_of_many():
+    for rotation in Rotation.random(50, random_state=3).as_matrix():
+        T = rigid(rotation, [1.5, -2.5, 1e4])
+        many = wire_poses(T[None, :3, 3], quat_from_matrix(T[None, :3, :3]), "poses")
+        assert wire_pose(T, "a pose") == many[0]
