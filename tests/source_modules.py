@@ -45,3 +45,27 @@ def modules():
         )
     gc.enable()
     return tuple(found)
+
+
+def dotted(node):
+    """Return ``a.b.c`` of nested attributes; empty where the innermost is no name."""
+    if isinstance(node, ast.Attribute):
+        inner = dotted(node.value)
+        return f"{inner}.{node.attr}" if inner else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def foreign_names(module):
+    """Return the names that a module imports from other distributions: name -> what it stands
+    for.
+    """
+    found: dict[str, str] = {}
+    for node in module.nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                first = alias.name.split(".")[0]
+                found[alias.asname or first] = alias.name if alias.asname else first
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            for alias in node.names:
+                found[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    return {name: what for name, what in found.items() if what.split(".")[0] not in PACKAGES}

@@ -7,8 +7,7 @@ import re
 
 import pytest
 
-from tests.source_modules import modules
-from tests.test_style import dotted, foreign_names
+from tests.source_modules import dotted, foreign_names, modules
 
 # What opens a file, by the name that it has in its library.
 OPENERS = re.compile(

@@ -4,7 +4,7 @@ import ast
 import re
 from collections import Counter
 
-from tests.source_modules import PACKAGES, REPO, modules
+from tests.source_modules import REPO, dotted, foreign_names, modules
 
 # Module -> why a user would wait a fifth longer without it. `goes`: it is on its way out.
 ALLOWED: dict[str, str] = {}
@@ -14,30 +14,6 @@ STANDARD = ("os._exit", "sys._getframe")  # documented, whatever their names
 
 def is_private(name):
     return any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
-
-
-def dotted(node):
-    """Return ``a.b.c`` of nested attributes; empty where the innermost is no name."""
-    if isinstance(node, ast.Attribute):
-        inner = dotted(node.value)
-        return f"{inner}.{node.attr}" if inner else ""
-    return node.id if isinstance(node, ast.Name) else ""
-
-
-def foreign_names(module):
-    """Return the names that a module imports from other distributions: name -> what it stands
-    for.
-    """
-    found: dict[str, str] = {}
-    for node in module.nodes:
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                first = alias.name.split(".")[0]
-                found[alias.asname or first] = alias.name if alias.asname else first
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            for alias in node.names:
-                found[alias.asname or alias.name] = f"{node.module}.{alias.name}"
-    return {name: what for name, what in found.items() if what.split(".")[0] not in PACKAGES}
 
 
 def private_uses(module):
