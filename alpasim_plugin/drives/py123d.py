@@ -167,6 +167,7 @@ def _met(folder: Path, keys: Sequence[str]) -> Iterator[str]:
         if field_name("log", holder) not in PY123D.names():
             continue
         path = folder / f"{key}.arrow"
+        check_regular(path, ARCHIVE_BYTES, DO_THIS)
         with parsing(path, DO_THIS, "no Arrow file of py123d"):
             schema = pa.ipc.open_file(pa.memory_map(str(path))).schema
             facts = msgpack.unpackb((schema.metadata or {})[b"metadata"], strict_map_key=False)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from alpasim_plugin.alpasim.client.channel import channel_options
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.log.wire.services import channel_options
 
 
 def test_a_time_limit_that_is_no_number_is_bad_input():

@@ -7,7 +7,7 @@ import sys
 import grpc
 
 from ...log.wire import common_pb2, sensorsim_pb2
-from ...log.wire.services import OPTIONS, Stub
+from ...log.wire.services import Stub, channel_options
 
 WAIT_S = 30.0  # for a server that starts
 TIMEOUT_S = 300.0  # of a call that may load a scene
@@ -22,7 +22,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("usage: onefixer-bridge HOST:PORT [SCENE]", file=sys.stderr)
         return 2
     try:
-        with grpc.insecure_channel(words[0], list(OPTIONS)) as channel:
+        with grpc.insecure_channel(words[0], channel_options(words[0])) as channel:
             service = Stub(channel, "SensorsimService")
             empty = common_pb2.Empty()
             version = service.get_version(empty, timeout=WAIT_S, wait_for_ready=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunEr
 from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2
-from alpasim_plugin.log.wire.services import OPTIONS, Stub, is_lost_connection
+from alpasim_plugin.log.wire.services import Stub, channel_options, is_lost_connection
 
 READY_S = 30.0  # how long a service may take to accept its first call
 CALL_S = 300.0  # AlpaSim's own deadline of a render
@@ -57,17 +56,6 @@ def encoding_of(address: str, encoding: str) -> ImageEncoding:
     if encoding not in get_args(ImageEncoding):
         raise InputError(f"{address}: encoding {encoding!r}", "write encoding=jpeg or encoding=png")
     return cast("ImageEncoding", encoding)
-
-
-LOOPBACK = re.compile(r"(127\.[0-9.]+|localhost|\[::1\]):[0-9]+|unix:.*")
-
-
-def channel_options(target: str) -> list[tuple[str, int]]:
-    """Return the options of a channel: one to this machine goes through no proxy, whatever
-    ``http_proxy`` says.
-    """
-    is_here = LOOPBACK.fullmatch(target) is not None
-    return [*OPTIONS, *([("grpc.enable_http_proxy", 0)] if is_here else [])]
 
 
 class Service:

@@ -29,7 +29,7 @@ from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.log.wire import api_version, common_pb2
-from alpasim_plugin.log.wire.services import OPTIONS, Stub
+from alpasim_plugin.log.wire.services import Stub, channel_options
 
 RECONNECT = (
     ("grpc.min_reconnect_backoff_ms", 200),
@@ -107,7 +107,7 @@ class Upstream:
 
     def channel(self) -> Any:
         """Open a channel."""
-        options = [*OPTIONS, *RECONNECT]
+        options = [*channel_options(self.address), *RECONNECT]
         if self.ca is None:
             if self.token is not None:
                 raise InputError(

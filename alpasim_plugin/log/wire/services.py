@@ -9,6 +9,7 @@ So every file is copied with its package renamed into a separate pool; protobuf'
 holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
 """
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,8 +33,7 @@ OPTIONS: tuple[tuple[str, int], ...] = (
     ("grpc.max_receive_message_length", MESSAGE_BYTES),
     ("grpc.max_send_message_length", MESSAGE_BYTES),
 )
-
-
+LOOPBACK = re.compile(r"(127\.[0-9.]+|localhost|\[::1\]):[0-9]+|unix:.*")
 #: What gRPC says, as UNKNOWN or INTERNAL, where a connection broke in the middle of a call.
 BROKEN_TRANSPORT = ("Stream removed", "Connection reset", "RST_STREAM", "Socket closed", "GOAWAY")
 #: Packages as AlpaSim names them, by the last part of ours; "" is no package.
@@ -54,6 +54,14 @@ OURS = ".simrun.wire."
 V1ALPHA = "/grpc.reflection.v1alpha.ServerReflection/"
 NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
 UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
+
+
+def channel_options(target: str) -> list[tuple[str, int]]:
+    """Return the options of a channel: one to this machine goes through no proxy, whatever
+    ``http_proxy`` says.
+    """
+    is_here = LOOPBACK.fullmatch(target) is not None
+    return [*OPTIONS, *([("grpc.enable_http_proxy", 0)] if is_here else [])]
 
 
 def is_lost_connection(error: Any) -> bool:
