@@ -191,6 +191,14 @@ class Osm:
                 f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
                 "give them to all nodes, or to none",
             )
+        half = [
+            key for key in places if key in local and not {"local_x", "local_y"} <= {*places[key]}
+        ]
+        if half:
+            raise InputError(
+                f"{self.path}, node {half[0]}: one of local_x and local_y without the other",
+                "give both in metres",
+            )
         if not local and any("lat" not in place or "lon" not in place for place in places.values()):
             key = next(key for key, place in places.items() if not {"lat", "lon"} <= {*place})
             raise InputError(

@@ -422,7 +422,7 @@ def _section(
                 densify((left + right) / 2),
                 left,
                 right,
-                kind,
+                "bus" if lane.closed and kind == "vehicle" else kind,
                 left_neighbour=beside_ids[0],
                 right_neighbour=beside_ids[1],
                 left_mark_type=mark_types[0],

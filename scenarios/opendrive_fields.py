@@ -29,7 +29,9 @@ OPENDRIVE = Fields(
         "lanes": "laneOffset laneSection",
         "laneSection": "@s @singleSide left center right",
         **dict.fromkeys(("left", "center", "right"), _SIDE),
-        "lane": "@id @type @level @direction link width border roadMark speed",
+        "lane": "@id @type @level @direction link width border roadMark speed access",
+        "access": "@sOffset @rule @restriction restriction",
+        "restriction": "@type",
         **dict.fromkeys(("width", "border"), f"@sOffset {_CUBIC}"),
         "roadMark": "@type @color",
         "objects": "object",
@@ -58,6 +60,7 @@ OPENDRIVE = Fields(
         "road": "@name userData surface dataQuality",
         "type": "@type @country userData",
         "laneSection": "userData",
+        "shape": f"{_PLACE} {_CUBIC}",  # a note of its own counts them
         "lane": "userData material @roadWorks @dynamicLaneDirection @dynamicLaneType",
         "roadMark": """@sOffset @weight @material @width @laneChange @height type sway explicit
             userData""",

@@ -38,6 +38,8 @@ STOP_LINE = "294"
 CROSSWALK = "1000003"
 CROSSWALK_M = 4.0
 UNITS_MPS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
+# Road users of access rules that the ego and the cars around it are.
+CARS = frozenset({"passengerCar", "autonomousTraffic"})
 JOIN_M = 0.01  # records of a reference line that lie farther apart do not join
 _ABCD = ("a", "b", "c", "d")
 _PARAMETERS = {
@@ -166,6 +168,7 @@ class OdrLane:
     reversed: bool = False  # driven against the usual direction of its side
     level: bool = False  # it and the lanes outside of it are not banked with the road
     limits: tuple[Limit, ...] = ()  # of its own, which go before those of the road
+    closed: bool = False  # its access rules keep cars out
 
 
 @dataclass(frozen=True)
@@ -329,6 +332,9 @@ def parse_map(location: Path | str, root: Element) -> OdrMap:
         notes.append(
             f"lanes that change their marking inside a section, of which the first holds: {repainted}"
         )
+    closed = sum(_closed_to_cars(lane) for lane in root.iter("lane"))
+    if closed:
+        notes.append(f"lanes that access rules close to cars are not driven by them: {closed}")
     shapes = len(root.findall(".//lateralProfile/shape"))
     if shapes:
         notes.append(f"{shapes} cross section shapes of the map are not used")
@@ -488,6 +494,21 @@ def _geometry(record: Element, location: str, road_m: float) -> Geometry:
     return Geometry(s, x, y, heading, length, shape.tag, numbers, normalised)
 
 
+def _closed_to_cars(lane: Element) -> bool:
+    """Return whether the access rules of a lane keep cars out, on a part of it or all along.
+
+    Where a rule allows some, all others are kept out; a rule that does not say what it does
+    restricts those that it names.
+    """
+    allowed: set[str] = set()
+    denied: set[str] = set()
+    for access in lane.findall("access"):
+        names = {access.get("restriction", "")}
+        names |= {part.get("type", "") for part in access.findall("restriction")}
+        (allowed if access.get("rule") == "allow" else denied).update(names - {""})
+    return bool(denied & CARS) or bool(allowed and not allowed & CARS)
+
+
 def _section(element: Element, start_m: float, end_m: float) -> Section:
     lanes = []
     for side in ("left", "center", "right"):
@@ -510,6 +531,7 @@ def _section(element: Element, start_m: float, end_m: float) -> Section:
                         (start_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
                         for limit in lane.findall("speed")
                     ),
+                    _closed_to_cars(lane),
                 )
             )
     return Section(start_m, end_m, tuple(lanes))

@@ -204,3 +204,26 @@ def test_fields_that_are_not_read_are_named():
     height = '<height sOffset="0" inner="0.1" outer="0.1"/></lane>'
     _, notes = read(road("1", section(0, lane(-1).replace("</lane>", height))))
     assert "OpenDRIVE: not read are lane/height (1)" in notes
+
+
+NESTED = '<access sOffset="0" rule="deny"><restriction type="passengerCar"/></access>'
+
+
+@pytest.mark.parametrize(
+    ("access", "kind"),
+    [
+        ('<access sOffset="0" rule="allow" restriction="trucks"/>', "bus"),
+        ('<access sOffset="0" rule="allow" restriction="emergency"/>', "bus"),
+        ('<access sOffset="10" rule="deny" restriction="passengerCar"/>', "bus"),
+        (NESTED, "bus"),
+        ('<access sOffset="0" rule="allow" restriction="passengerCar"/>', "vehicle"),
+        ('<access sOffset="0" rule="allow" restriction="autonomousTraffic"/>', "vehicle"),
+        ('<access sOffset="0" rule="deny" restriction="bicycle"/>', "vehicle"),
+    ],
+)
+def test_lanes_that_access_rules_close_to_cars_are_not_lanes_of_cars(access, kind):
+    text = lane(-2).replace("</lane>", f"{access}</lane>")
+    lanes, notes = read(road("1", section(0, lane(-1), text)))
+    assert (lanes.lanes["1.0.-1"].kind, lanes.lanes["1.0.-2"].kind) == ("vehicle", kind)
+    assert any("access rules close to cars" in note for note in notes) == (kind == "bus")
+    assert "not read" not in str(notes)
