@@ -21,6 +21,7 @@ from alpasim_plugin.gaussians.fit.photographs import (
     FILE,
     TRANSFORMS,
     PosedPhotograph,
+    angle_notes,
     inside,
     present,
     read_points,
@@ -143,7 +144,7 @@ def _file_notes(listed: Sequence[PosedPhotograph], missing: Sequence[str]) -> li
             f"{len(missing)} of {len(listed)} listed photographs are missing and left out: {some_of(missing)}"
         )
     keys = (field_name("frame", key) for photograph in listed for key in photograph.more)
-    return [*notes, *TRANSFORMS.notes(keys)]
+    return [*notes, *angle_notes(listed), *TRANSFORMS.notes(keys)]
 
 
 def _with_cameras(folder: Path, photographs: Sequence[PosedPhotograph]) -> list[PosedPhotograph]:

@@ -589,3 +589,14 @@ def test_keys_of_transforms_by_which_cameras_differ_are_refused(tmp_path, key, v
 def test_a_shutter_of_no_duration_changes_nothing(tmp_path):
     folder = transforms(tmp_path / "a", NAMES, rolling_shutter=[0.0, 0.0, 0.0, 0.0])
     assert along(read_source(folder, need_files=False)) == STRAIGHT
+
+
+@pytest.mark.parametrize(("key", "angle"), [("camera_angle_x", 0.86), ("y_fov", 30.0)])
+def test_a_focal_length_and_an_angle_of_view_that_disagree_are_said(tmp_path, key, angle):
+    folder = transforms(tmp_path / "a", NAMES, **{key: angle})
+    drive = read_source(folder, need_files=False)
+    assert drive.photographs[0].lens.K[0, 0] == FOCAL
+    assert any("disagree" in note and key in note for note in drive.notes)
+    agreeing = {"camera_angle_x": 2 * float(np.arctan(0.5 * WIDTH / FOCAL))}
+    calm = read_source(transforms(tmp_path / "b", NAMES, **agreeing), need_files=False)
+    assert not any("disagree" in note for note in calm.notes)

@@ -83,6 +83,7 @@ TRANSFORMS = Fields(
             transform_matrix_start transform_matrix_end"""
     },
 )
+SAME_FOCAL = 0.01  # shares by which two statements of a focal length may differ
 WHOLE = "give a whole PNG or JPEG in grey or RGB"
 RIGID = 1e-12  # a rotation this exact is taken as it is written
 
@@ -306,6 +307,24 @@ def _focal_lengths(frame: Mapping[str, Any], width: int, height: int) -> tuple[f
     if not lengths:
         raise KeyError("fl_x")
     return lengths.get("x", lengths.get("y", np.nan)), lengths.get("y", lengths.get("x", np.nan))
+
+
+def angle_notes(photographs: Sequence[PosedPhotograph]) -> tuple[str, ...]:
+    """Return a note where a file states a focal length and an angle of view that disagree."""
+    unlike = []
+    for photograph in photographs:
+        lens = photograph.lens
+        for axis, size, used in (("x", lens.width, lens.K[0, 0]), ("y", lens.height, lens.K[1, 1])):
+            for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", np.pi / 180)):
+                stated = photograph.more.get(key)
+                if stated is None:
+                    continue
+                by_angle = 0.5 * size / np.tan(0.5 * unit * float(stated))
+                if abs(by_angle - used) > SAME_FOCAL * used:
+                    unlike.append(f"{used:.1f} px is used, {key} says {by_angle:.1f} px")
+    if not unlike:
+        return ()
+    return (f"focal lengths that disagree, in {len(unlike)} places: {unlike[0]}",)
 
 
 def _lens(frame: Mapping[str, Any], file: Path, location: str) -> Lens:
