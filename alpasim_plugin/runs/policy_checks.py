@@ -10,6 +10,7 @@ from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.registry import entries
+from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.runs.cameras import CameraRig
@@ -84,6 +85,8 @@ def check_policies(
             frames_asked(policy, scenarios)
         elif policy.address is None:
             todo.append(policy)
+        if policy.address is not None:
+            _check_address(policy, scenarios)
     workers = min(how.threads.workers, len(todo))
     limit_s = how.limit_s or LIMIT_S
     check = partial(_check, scenarios)
@@ -107,6 +110,17 @@ def check_policies(
         for _, sentence in checks[policy.name]["breaches"]:
             noticed(f"check of {policy.name}: {sentence}")
     return checks
+
+
+def _check_address(policy: PartSpec, scenarios: Iterable[Scenario]) -> None:
+    """Let a policy behind an address refuse scenarios whose images cannot be sent to it.
+
+    Raises:
+        InputError: It does.
+    """
+    factory = load(policy.target, "policy")
+    for scenario in scenarios if hasattr(factory, "check_scenario") else ():
+        factory.check_scenario(scenario, policy.address)
 
 
 def hanging(checks: JsonView) -> dict[str, str]:

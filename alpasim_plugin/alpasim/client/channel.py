@@ -13,11 +13,17 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunEr
 from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.log.images import ImageEncoding
 from alpasim_plugin.log.wire import common_pb2
-from alpasim_plugin.log.wire.services import Stub, channel_options, is_lost_connection
+from alpasim_plugin.log.wire.services import (
+    MESSAGE_BYTES,
+    Stub,
+    channel_options,
+    is_lost_connection,
+)
 
 READY_S = 30.0  # how long a service may take to accept its first call
 CALL_S = 300.0  # AlpaSim's own deadline of a render
 RETRY_S = (0.5, 2.0)  # AlpaSim's own waits before a second and a third attempt
+TOO_LARGE = "message larger than max"  # what gRPC says on either side
 PASSING_TEXTS = ("Stopped waiting for backend", "A load persistent id instruction was encountered")
 
 
@@ -103,8 +109,8 @@ class Service:
         Raises:
             SimrunError: Of the class that the constructor was given: the service answered with an
                 error status, or not in time.
-            InfrastructureError: Nobody listens there any more, or the connection was lost before
-                the answer.
+            InfrastructureError: Nobody listens there any more, the connection was lost before
+                the answer, or a message is larger than the service takes.
         """
         ask: Callable[..., Any] = getattr(self.stub, method)
         for wait_s in (*(RETRY_S if self._retries else ()), None):
@@ -126,6 +132,12 @@ class Service:
             self.target if at_us is None else f"{self.target}, at {at_us} us of simulated time"
         )
         problem = f"{self.name}.{method} failed: {error.code().name}: {error.details() or ''}"
+        if TOO_LARGE in (error.details() or ""):
+            return InfrastructureError(
+                f"{location}: {problem}",
+                "send smaller images (?encoding=jpeg, a smaller camera), or let the service take "
+                f"messages of {MESSAGE_BYTES >> 20} MiB",
+            )
         if not is_lost_connection(error) or issubclass(self._error, InfrastructureError):
             return self._error(f"{location}: {problem}", "see the service's own log")
         return InfrastructureError(

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.child import Child, exit_reason
-from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy
+from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy, cameras_sent
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.core.subprocesses import say
@@ -31,6 +31,7 @@ from alpasim_plugin.core.types import Scenario
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"
 VARIABLE = "SIMRUN_POLICY_ADDRESS"
+ENCODING = "png"  # what the policy sees is what it would see in this process
 READY_S = 120.0  # a container starts, a network is loaded
 POLL_S = 0.02
 REAP_S = 1.0  # between the end of a connection and that of the process behind it
@@ -270,13 +271,18 @@ class CommandPolicy(DriverPolicy):
         try:
             super().__init__(
                 scenario,
-                Address(self._served.address, {"encoding": "png", **command.options}),
+                Address(self._served.address, {"encoding": ENCODING, **command.options}),
                 None,
             )
         except SimrunError:
             self._served.require_running(REAP_S)
             raise
         self._facts |= {"command": address}
+
+    @staticmethod
+    def check_scenario(scenario: Scenario, address: str) -> None:
+        """Refuse a scenario whose images cannot be sent, before a run begins."""
+        cameras_sent(scenario, Command.parse(address).options, None, ENCODING)
 
     @staticmethod
     def check_address(address: str) -> None:

@@ -13,7 +13,7 @@ import itertools
 import os
 import re
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from alpasim_plugin.core.types import (
     SensorSpec,
     Trajectory,
 )
-from alpasim_plugin.log.images import encode_image
+from alpasim_plugin.log.images import ImageEncoding, encode_image
 from alpasim_plugin.log.schema import (
     read_trajectory,
     wire_camera,
@@ -45,9 +45,13 @@ from alpasim_plugin.log.schema import (
     wire_trajectory,
 )
 from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
+from alpasim_plugin.log.wire.services import MESSAGE_BYTES
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
+# An image of noise at the quality of `encode_image`, rounded up; PNG leaves it as it is.
+MOST_BYTES_PER_PIXEL: Mapping[ImageEncoding, float] = {"png": 3.1, "jpeg": 2.5}
+HEADER_BYTES = 1 << 20  # the rest of a message
 # sessions of several rollouts of one scene and seed may be open at one driver
 _SESSIONS = itertools.count()
 
@@ -66,7 +70,7 @@ class DriverPolicy(Policy):
 
     def __init__(self, scenario: Scenario, place: Address, main: str | None) -> None:
         self._scenario = scenario
-        self._cameras = cameras_of(scenario, place.options.get("cameras"), main)
+        self._cameras = cameras_sent(scenario, place.options, main)
         self.sensors: Sequence[SensorSpec] = tuple(
             SensorSpec(camera.name) for camera in self._cameras.values()
         )
@@ -254,6 +258,11 @@ class AlpasimPolicy(DriverPolicy):
         super().__init__(scenario, Address.parse("alpasim", address, OPTIONS), FRONT_WIDE)
 
     @staticmethod
+    def check_scenario(scenario: Scenario, address: str) -> None:
+        """Refuse a scenario whose images cannot be sent, before a run begins."""
+        cameras_sent(scenario, Address.parse("alpasim", address, OPTIONS).options, FRONT_WIDE)
+
+    @staticmethod
     def check_address(address: str) -> None:
         """Refuse what is no address, before a run begins."""
         place = Address.parse("alpasim", address, OPTIONS)
@@ -262,6 +271,27 @@ class AlpasimPolicy(DriverPolicy):
             raise InputError(
                 f"alpasim://{address}: timeout_s={timeout!r}", "write seconds as a number"
             )
+
+
+def cameras_sent(
+    scenario: Scenario, options: Mapping[str, str], main: str | None, encoding: str = "jpeg"
+) -> dict[str, CameraSpec]:
+    """Return the cameras whose images are sent to a driver, by its names for them.
+
+    Args:
+        scenario: Has the cameras.
+        options: ``cameras`` and ``encoding``, as an address has them.
+        main: See `cameras_of`.
+        encoding: Where the options name none.
+
+    Raises:
+        InputError: As `cameras_of`, an encoding that the wire has not, or an image that may not fit
+            into a message.
+    """
+    cameras = cameras_of(scenario, options.get("cameras"), main)
+    text = options.get("encoding", encoding)
+    require_room(cameras.values(), encoding_of(f"scene {scenario.scene_id!r}", text))
+    return cameras
 
 
 def cameras_of(
@@ -298,6 +328,23 @@ def cameras_of(
             "write ?cameras=THEIRS:OURS,...",
         )
     return {a: cameras_by_name[b] for a, b in pairs}
+
+
+def require_room(cameras: Iterable[CameraSpec], encoding: ImageEncoding) -> None:
+    """Refuse cameras whose images may not fit into a message.
+
+    Raises:
+        InputError: Naming the first.
+    """
+    for camera in cameras:
+        most_bytes = MOST_BYTES_PER_PIXEL[encoding] * camera.width * camera.height
+        if most_bytes > MESSAGE_BYTES - HEADER_BYTES:
+            smaller = "write ?encoding=jpeg, or use" if encoding == "png" else "use"
+            raise InputError(
+                f"camera {camera.name!r}: {camera.width}x{camera.height} pixels as {encoding} may "
+                f"take {most_bytes / 2**20:.0f} MiB, more than a message's {MESSAGE_BYTES >> 20}",
+                f"{smaller} a smaller camera",
+            )
 
 
 def in_rig(plan: Trajectory, observation: Observation, times: I64 | None = None) -> tuple[I64, F64]:
