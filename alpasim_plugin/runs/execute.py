@@ -6,7 +6,6 @@ seed, component, step) and the rasteriser is bit-equal for any number of threads
 therefore run rollouts in any order.
 """
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
+from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.files.stage import shown_in
@@ -63,9 +63,7 @@ def thread_budget(workers: int | None, n_cells: int, executor: Executor = LOCAL)
     """
     if not executor.is_local:
         return Threads(max(1, min(workers or n_cells, n_cells)), executor.cores)
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    cores = usable_cores()
     chosen = max(1, min(workers or cores, max(n_cells, 1)))
     return Threads(chosen, max(1, cores // chosen))
 

@@ -34,13 +34,16 @@ class Film:
 
     def save(self, folder: Path) -> None:
         """Write ``front.mp4``; nothing without frames. A camera without a frame at an instant shows
-        its newest one, or else its first.
+        its newest one, or else its first. Cameras stand in the order of their first frames.
         """
         times = sorted(self._shots)
         if not times:
             return
         step_us = int(np.diff(times).min(initial=SECOND_US))
-        shots = {name: shot for t_us in reversed(times) for name, shot in self._shots[t_us].items()}
+        shots: dict[str, bytes] = {}
+        for t_us in times:
+            for name, shot in self._shots[t_us].items():
+                shots.setdefault(name, shot)
         tick = Fraction(1, SECOND_US)
         with VideoWriter(folder / VIDEO_NAME, tick, Fraction(SECOND_US, step_us)) as video:
             for t_us in times:

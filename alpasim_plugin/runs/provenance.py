@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from alpasim_plugin import __version__
+from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.json_types import JsonObject
 from evaluators.results import FixerFacts
 
@@ -57,13 +58,12 @@ def versions() -> dict[str, str]:
 
 def hardware() -> JsonObject:
     """Return the processor, the cores that this process may use, memory and operating system."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = (
         os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else None
     )
     return {
         "cpu": _cpu_name(),
-        "cores": cores,
+        "cores": usable_cores(),
         "memory_gib": round(memory / 2**30, 1) if memory else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python_optimised": sys.flags.optimize > 0,

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from alpasim_plugin import OWN_PACKAGES
+from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.files import file_sha256, read_bytes
 from alpasim_plugin.core.files.atomic import disk_error
@@ -76,8 +77,7 @@ def connected(address: str) -> Iterator[Any]:
         except ConnectionError:
             if address:
                 raise
-            cores = len(os.sched_getaffinity(0))
-            ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
+            ray.init(address="local", num_cpus=usable_cores(), include_dashboard=False, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise InfrastructureError(
             f"--executor ray: no cluster at {address or 'this machine'}: {error}",

@@ -140,6 +140,21 @@ def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(t
     assert_allclose(shown.frames[:, 4, 24], [[50] * 3, [50] * 3, [150] * 3], atol=3)
 
 
+def test_cameras_of_a_film_stand_in_the_order_of_their_first_frames_whatever_their_periods(
+    tmp_path,
+):
+    film = Film()
+    for t_us, names in ((0, ("front", "left")), (200_000, ("left",)), (400_000, ("left", "front"))):
+        for name in names:
+            level = {"front": 200, "left": 50}[name]
+            film.add(Frame(t_us, name, np.full((16, 16, 3), level, np.uint8)))
+    film.add(Frame(600_000, "left", np.full((16, 16, 3), 50, np.uint8)))
+    film.save(tmp_path)
+    shown = read_mp4(tmp_path / "front.mp4")
+    assert_allclose(shown.frames[:, 8, 8], [[200] * 3] * 4, atol=3)
+    assert_allclose(shown.frames[:, 8, 24], [[50] * 3] * 4, atol=3)
+
+
 def test_a_rollout_that_failed_is_not_copied(tmp_path):
     plan = plan_of("tests.runs.broken_policies:Raises")
     summary, _ = drive(plan, tmp_path)

@@ -12,6 +12,7 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
+from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.runs.cell import MANIFEST
@@ -183,7 +184,7 @@ def test_a_full_disk_fails_the_rollout_and_keeps_the_finished_ones(tmp_path):
 
 
 def test_workers_times_threads_never_exceed_the_cores():
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     for wanted in (None, 1, 2, 3, 64):
         for cells in (0, 1, 2, 1000):
             budget = thread_budget(wanted, cells)

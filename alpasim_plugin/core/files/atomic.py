@@ -80,24 +80,44 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
     block raises.
 
+    A folder cannot be renamed onto another one: the old one is moved aside first. Where the process
+    is killed between the two, `restore_folder` brings it back.
+
     Raises:
         InfrastructureError: The disk refuses.
     """
     partial = temporary_path(folder)
-    old = temporary_path(folder)
+    old = _aside(folder)
     try:
+        restore_folder(folder)
         partial.mkdir(parents=True)
         yield partial
         if os.path.exists(folder):
+            shutil.rmtree(old, ignore_errors=True)
             folder.replace(old)
         partial.replace(folder)
     except OSError as error:
-        if os.path.exists(old) and not os.path.exists(folder):
-            old.replace(folder)
+        with contextlib.suppress(OSError):
+            restore_folder(folder)
         raise disk_error(folder, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+        if os.path.exists(folder):
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _aside(folder: Path) -> Path:
+    """Return where a folder lies while a new one takes its name."""
+    return folder.with_name(f".{folder.name}.old")
+
+
+def restore_folder(folder: Path) -> None:
+    """Bring back a folder that `atomic_folder` had moved aside when its process was killed; whoever
+    looks for a folder that is written so calls this first.
+    """
+    old = _aside(folder)
+    if os.path.exists(old) and not os.path.exists(folder):
+        old.replace(folder)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import places
-from alpasim_plugin.core.files.atomic import atomic_folder
+from alpasim_plugin.core.files.atomic import atomic_folder, restore_folder
 from alpasim_plugin.core.files.lock import one_writer
 from alpasim_plugin.core.printing import warn
 
@@ -57,6 +57,7 @@ def cached(
         # of a process that was killed while it made this entry
         for left_over in folder.parent.glob(f".{key}.*.tmp"):
             shutil.rmtree(left_over)
+        restore_folder(folder)
         if os.path.exists(folder):
             try:
                 return read(folder)

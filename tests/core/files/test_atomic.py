@@ -144,3 +144,37 @@ def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(InputError):
         write_bytes(tmp_path / name, b"a")
+
+
+KILLED_BETWEEN = """
+import os, signal, sys
+from pathlib import Path
+from alpasim_plugin.core.files.atomic import atomic_folder
+
+rename = Path.replace
+
+def replace(self, target):
+    rename(self, target)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+Path.replace = replace
+with atomic_folder(Path(sys.argv[1])) as partial:
+    (partial / "x").write_text("new")
+"""
+
+
+def test_a_process_killed_between_the_two_renames_leaves_the_old_folder_to_the_next(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "x").write_text("old")
+    words = [sys.executable, "-c", KILLED_BETWEEN, str(folder)]
+    assert subprocess.run(words, check=False).returncode == -9
+    assert not folder.exists()
+    with pytest.raises(ValueError, match="no"), atomic_folder(folder):  # noqa: PT012 - the block is what fails
+        assert (folder / "x").read_text() == "old"
+        raise ValueError("no")
+    assert (folder / "x").read_text() == "old"
+    with atomic_folder(folder) as partial:
+        (partial / "x").write_text("newer")
+    assert (folder / "x").read_text() == "newer"
+    assert not folder.with_name(".a.old").exists()

@@ -101,3 +101,12 @@ def test_of_processes_that_ask_at_once_one_makes_and_the_others_wait(own_cache):
     answers = [p.communicate(timeout=250) for p in asking]
     assert {out.strip() for out, _ in answers} in ({"a"}, {"b"})
     assert sum("a text ..." in err for _, err in answers) == 1
+
+
+def test_an_entry_that_was_moved_aside_when_its_maker_was_killed_is_read_again(own_cache):
+    def make(folder):
+        (folder / "text").write_text("good 3")
+
+    cached("texts", "k", make, read, "a text")
+    (own_cache / "texts" / "k").rename(own_cache / "texts" / ".k.old")
+    assert cached("texts", "k", pytest.fail, read, "a text") == "good 3"
