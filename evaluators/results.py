@@ -16,6 +16,7 @@ from alpasim_plugin.core.files import parse_json, read_bytes, read_record
 from alpasim_plugin.core.files.limits import JSON_BYTES
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import Direction
+from alpasim_plugin.log.run_folder.records import Pool, Repeat
 
 SCHEMA = 2  # of summary.json
 
@@ -120,8 +121,13 @@ class Mean:
 
 @dataclass(frozen=True)
 class SceneCounts:
-    """Scenes whose mean difference is positive, negative or zero, and the exact two-sided p of
-    their sign test.
+    """Which way scenes went.
+
+    Attributes:
+        up: Scenes whose mean difference is positive.
+        down: Scenes whose mean difference is negative.
+        same: Scenes without a difference.
+        p_value: Exact two-sided p of their sign test.
     """
 
     up: int
@@ -132,8 +138,12 @@ class SceneCounts:
 
 @dataclass(frozen=True)
 class CellCounts:
-    """Cells with an event on one side alone, and the exact McNemar p, as if cells were
-    independent.
+    """Cells with an event on one side alone.
+
+    Attributes:
+        only_here: Cells with the event only behind the variant.
+        only_baseline: Cells with the event only behind the baseline.
+        p_value: Exact McNemar p, as if cells were independent.
     """
 
     only_here: int
@@ -163,6 +173,7 @@ class MissingPair:
     """A planned cell without a pair.
 
     Attributes:
+        policy, scene, seed: The cell.
         missing: The side without a value.
         why: Its cause, in words.
     """
@@ -239,8 +250,11 @@ DifferenceTable = dict[str, dict[str, Difference]]  # VARIANT -> METRIC -> diffe
 
 @dataclass(frozen=True)
 class EventPlace:
-    """The rollout in which something happened, and when after its first frame, as far as that is
-    known.
+    """The rollout in which something happened.
+
+    Attributes:
+        scene, seed: Of the rollout.
+        t_s: When, seconds after the first frame; None where it is not known.
     """
 
     scene: str
@@ -250,7 +264,12 @@ class EventPlace:
 
 @dataclass(frozen=True)
 class EventCount:
-    """How many rollouts had an outcome, and the first of them."""
+    """The rollouts that had an outcome.
+
+    Attributes:
+        n: How many.
+        cells: The first of them.
+    """
 
     n: int
     cells: tuple[EventPlace, ...]
@@ -281,7 +300,12 @@ class Endings:
 
 @dataclass(frozen=True)
 class InvalidValues:
-    """Rollouts without a valid value of a metric, and reason -> how many have it."""
+    """Rollouts without a valid value of a metric.
+
+    Attributes:
+        rollouts: How many.
+        reasons: Reason -> rollouts that have it.
+    """
 
     rollouts: int
     reasons: dict[str, int]
@@ -331,7 +355,13 @@ class Censoring:
 
 @dataclass(frozen=True)
 class RolloutError:
-    """Why a rollout could not be run or scored."""
+    """Why a rollout could not be run or scored.
+
+    Attributes:
+        message: What is wrong with which value.
+        hint: What to do.
+        failure_class: Whose fault it is (docs/cli.md).
+    """
 
     message: str
     hint: str
@@ -340,7 +370,13 @@ class RolloutError:
 
 @dataclass(frozen=True)
 class FailedRollout:
-    """A rollout that could not be run or scored; ``path`` is its folder below the run folder."""
+    """A rollout that could not be run or scored.
+
+    Attributes:
+        renderer, policy, scene, seed: Its key.
+        path: Its folder below the run folder.
+        error: Why.
+    """
 
     renderer: str
     policy: str
@@ -352,7 +388,14 @@ class FailedRollout:
 
 @dataclass(frozen=True)
 class Failures:
-    """How many rollouts could not be run or scored, by failure class, and which."""
+    """The rollouts that could not be run or scored.
+
+    Attributes:
+        n_failed: How many.
+        n_rollouts: Of how many.
+        by_class: Failure class -> rollouts.
+        cells: Each of them; empty where several runs are joined.
+    """
 
     n_failed: int
     n_rollouts: int
@@ -365,6 +408,7 @@ class StageSpeed:
     """Milliseconds of one pass of a stage, over the passes that took place.
 
     Attributes:
+        p50_ms, p95_ms: Median and 95th percentile.
         share: Of the time of all stages.
         per_frame_ms: Mean over all frames.
     """
@@ -381,6 +425,9 @@ class Speed:
     rollout has a frame after its first call.
 
     Attributes:
+        ms_per_frame_p50, ms_per_frame_p95, ms_per_frame_mean: Milliseconds per frame: median, 95th
+            percentile and mean.
+        frames_per_s: Frames a second, of one rollout.
         first_frame_ms: Of the frames of a rollout's first call, median over rollouts.
         stages: NAME -> its own time.
     """
@@ -431,22 +478,6 @@ class FixerFacts:
 
 
 @dataclass(frozen=True)
-class Pool:
-    """Throughput of all workers of a run together, start-up included.
-
-    Attributes:
-        executor: Where rollouts ran; None: on this machine.
-    """
-
-    workers: int
-    threads_per_worker: int
-    wall_s: float
-    frames: int
-    frames_per_s_total: float | None = None
-    executor: str | None = None
-
-
-@dataclass(frozen=True)
 class Summary:
     """``summary.json``: everything that pages, commands and gates say of a run's numbers.
 
@@ -465,7 +496,7 @@ class Summary:
         fixers: VARIANT -> what its fixer did.
         speed: VARIANT -> time per frame.
         pool: Throughput of the workers; None where nothing was driven.
-        repeat: What ``--repeat`` found (`alpasim_plugin.runs.repeat`).
+        repeat: What ``--repeat`` found.
         exit_code: Of ``simrun score``.
         alpasim: Files of AlpaSim's aggregation, or why there are none.
         boundary: What a search for a boundary found (`evaluators.statistics.boundary`).
@@ -485,7 +516,7 @@ class Summary:
     fixers: dict[str, FixerFacts] = field(default_factory=dict)
     speed: dict[str, Speed] = field(default_factory=dict)
     pool: Pool | None = None
-    repeat: dict[str, Any] | None = None
+    repeat: Repeat | None = None
     exit_code: int | None = None
     alpasim: dict[str, Any] | None = None
     boundary: dict[str, Any] | None = None

@@ -46,7 +46,7 @@ STAGES = {
     A + "log": (A + "log.wire",),
     RUN_FOLDER: LOG,
     A + "alpasim.client": (A + "world", A + "control", *LOG),  # parts that are a service's
-    "evaluators.results": (),
+    "evaluators.results": (RUN_FOLDER,),
     "evaluators.metrics": (RUN_FOLDER,),
     "evaluators.statistics": (RUN_FOLDER, "evaluators.results", "evaluators.metrics"),
     "evaluators.alpasim": ("evaluators.metrics", "evaluators.statistics"),

@@ -84,12 +84,10 @@ def compare(
         )
         whole = [rollout for run in opened for rollout in run.rollouts]
         scenario_names = list(
-            dict.fromkeys(name for run in opened for name in run.info.get("asked") or ())
+            dict.fromkeys(name for run in opened for name in run.info.asked or ())
         )
-        info = {**opened[0].info, "asked": scenario_names}
-        info["scenes"] = {
-            name: facts for run in opened for name, facts in run.info["scenes"].items()
-        }
+        scenes = {name: facts for run in opened for name, facts in run.info.scenes.items()}
+        info = replace(opened[0].info, asked=tuple(scenario_names), scenes=scenes)
         means = _with_endings(joined, opened, whole)
         overview_run = replace(opened[0], summary=means, rollouts=whole, info=info)
     else:

@@ -11,7 +11,8 @@ from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import resolve, resolve_renderer, split_names
-from alpasim_plugin.log.run_folder.reader import read_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.log.run_folder.schema import slug
 from alpasim_plugin.runs.fork import Change, fork_rollout
 from alpasim_plugin.runs.logged_rollout import find_rollout
@@ -58,15 +59,15 @@ def fork(
     change = Change(round(at * 1e6), renderer, policy, seed)
     root = out or run / "forks" / slug(f"{past.name} {change.label}")
     result = fork_rollout(past, change, root, ["simrun", *sys.argv[1:]])
-    fork_facts = read_json(root / "run.json")["fork"]
+    fork_facts = read_run_json(root).fork
     facts = {
         "out": str(root),
-        "fork": fork_facts,
+        "fork": None if fork_facts is None else json_of(fork_facts),
         "exit_code": result.exit_code,
         "summary": to_json(result.summary),
     }
     lines = []
-    if fork_facts:
+    if fork_facts is not None:
         lines.append(f"replay to {at:g} s   equal to the log, bit for bit")
     show(as_json, facts, *lines, f"report   {root / 'report.html'}")
     for failed in () if as_json else result.summary.failures.cells:

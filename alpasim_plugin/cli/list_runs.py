@@ -36,8 +36,8 @@ def list_runs(
     chosen = [
         entry
         for entry in entries
-        if _each_is_named(renderers, entry.info.get("renderers") or ())
-        and _each_is_named(policies, entry.info.get("policies") or ())
+        if _each_is_named(renderers, () if entry.info is None else entry.info.renderers)
+        and _each_is_named(policies, () if entry.info is None else entry.info.policies)
     ]
     stored = {
         name
@@ -54,7 +54,7 @@ def list_runs(
     count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
     show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
     for entry in entries:
-        if not as_json and not entry.info:
+        if not as_json and entry.info is None:
             warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
 
 

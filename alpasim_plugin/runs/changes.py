@@ -8,6 +8,7 @@ from alpasim_plugin.core.files import content_of, some_of
 from alpasim_plugin.core.files.inputs import ABSENT
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.log.run_folder.records import PartFacts, RunInfo
 from alpasim_plugin.log.run_folder.schema import INPUTS, SCORE_INPUTS
 from alpasim_plugin.runs.plan import SIMRUN, Cell, RunPlan
 
@@ -28,14 +29,14 @@ def changed_inputs(manifest: JsonView, member: str = INPUTS) -> dict[str, str]:
     return {path: content for path, content in now.items() if content != before[path]}
 
 
-def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> list[str]:
+def reasons(cell: Cell, manifest: JsonView, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Say why a rollout is driven again that another command, or an earlier one, drove; nothing where
     all that it was made of is as it was.
 
     Args:
         cell: The rollout as it is planned now.
         manifest: Of what was driven.
-        held: ``run.json`` of that time; empty where it is not known.
+        held: ``run.json`` of that time; None where it is not known.
         plan: The run.
     """
     changed = _file_changes(manifest.get(INPUTS) or {}, changed_inputs(manifest))
@@ -53,19 +54,21 @@ def reasons(cell: Cell, manifest: JsonView, held: JsonView, plan: RunPlan) -> li
     return changed
 
 
-def score_reasons(manifest: JsonView, held: JsonView, plan: RunPlan) -> list[str]:
+def score_reasons(manifest: JsonView, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Say why a rollout is scored again whose files are whole: the arguments are those of `reasons`."""
     changed = _file_changes(
         manifest.get(SCORE_INPUTS) or {}, changed_inputs(manifest, SCORE_INPUTS)
     )
     if manifest.get("preset") != plan.options.preset:
         changed.append(f"the preset was {manifest.get('preset')}")
-    stated: JsonView = held.get("parts") or {}
+    stated = {} if held is None else held.parts
     evaluators = [part for part in plan.parts if part.kind == "evaluator"]
     return changed + changed_evaluators(stated, evaluators)
 
 
-def changed_evaluators(stated: JsonView, evaluators: Sequence[PartSpec]) -> list[str]:
+def changed_evaluators(
+    stated: Mapping[str, PartFacts], evaluators: Sequence[PartSpec]
+) -> list[str]:
     """Say what is another one in the evaluators that a ``run.json`` states in ``parts``; nothing where
     it states none.
     """
@@ -78,7 +81,7 @@ def changed_evaluators(stated: JsonView, evaluators: Sequence[PartSpec]) -> list
         facts = before.get(name)
         if facts is None:
             changed.append(f"{name} is new")
-        elif facts.get("digest") != part.digest:
+        elif facts.digest != part.digest:
             files = _changes_of_part(facts, part)
             changed += files or [f"{name} is another one"]
     return changed + [f"{name} is left out" for name in before if name not in names]
@@ -91,28 +94,27 @@ def sentence(count: int, all_reasons: Sequence[str], action: str = "driven") -> 
     return f"{rollouts} {action} again: {some_of(causes, SHOWN_FILES)}"
 
 
-def _files_of(name: str, held: JsonView, plan: RunPlan) -> list[str]:
+def _files_of(name: str, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Name the files by which a scene or a part differs from what ``run.json`` states of it."""
+    if held is None:
+        return []
     kind, _, label = name.partition(" ")
     if kind == "scene":
-        facts: JsonView = (held.get("scenes") or {}).get(label) or {}
-        return _file_changes(facts.get("files") or {}, plan.scenarios[label].files)
-    stated: JsonView = held.get("parts") or {}
+        scene = held.scenes.get(label)
+        return _file_changes({} if scene is None else scene.files, plan.scenarios[label].files)
     changes: list[str] = []
     for part in plan.parts:
         if not _is_part_of(f"{part.kind} {part.name}", kind, label, plan):
             continue
-        changes += _changes_of_part(stated.get(f"{part.kind} {part.name}") or {}, part)
+        stated = held.parts.get(f"{part.kind} {part.name}")
+        if stated is not None:
+            changes += _changes_of_part(stated, part)
     return changes
 
 
-def _changes_of_part(facts: JsonView, part: PartSpec) -> list[str]:
+def _changes_of_part(stated: PartFacts, part: PartSpec) -> list[str]:
     """Name the files by which a part differs from what ``run.json`` states of it."""
-    changes: list[str] = []
-    for key, now in (("code", part.code), ("files", part.files)):
-        if key in facts:
-            changes += _file_changes(facts[key], now)
-    return changes
+    return [*_file_changes(stated.code, part.code), *_file_changes(stated.files, part.files)]
 
 
 def _is_part_of(part: str, kind: str, label: str, plan: RunPlan) -> bool:

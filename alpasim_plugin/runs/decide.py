@@ -17,6 +17,7 @@ from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import rollout_table
@@ -180,9 +181,9 @@ class SequentialTest:
         progress.looked(self.state, len(self.driven), len(self.plan.cells))
         write_json(root / DECISION, self.record())
 
-    def facts(self) -> JsonObject:
-        """Return nothing: ``decision.json`` holds the decision."""
-        return {}
+    def stated_in(self, info: RunInfo) -> RunInfo:
+        """Return ``run.json`` as it is: ``decision.json`` holds the decision."""
+        return info
 
     @property
     def outcome(self) -> Outcome:

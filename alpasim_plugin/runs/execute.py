@@ -17,8 +17,9 @@ from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.files.stage import shown_in
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.manifests import write_manifest
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
     copy_cell,
@@ -35,7 +36,6 @@ from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import Lost, apart, run_jobs
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
-NOTHING: JsonView = {}
 NOT_DRIVEN = "Correct the policy; it was not driven."
 
 OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
@@ -86,9 +86,9 @@ class HowToRun:
     executor: Executor = LOCAL
 
     @property
-    def stated(self) -> JsonObject:
-        """Give what ``run.json`` says of the executor; nothing for a run on this machine."""
-        return {} if self.executor.is_local else {"executor": str(self.executor)}
+    def stated(self) -> str | None:
+        """Give what ``run.json`` says of the executor; None for a run on this machine."""
+        return None if self.executor.is_local else str(self.executor)
 
     @property
     def local_threads(self) -> Threads:
@@ -107,7 +107,7 @@ def execute(
     how: HowToRun,
     on_done: OnDone,
     notify: Callable[[str], None],
-    held: JsonView = NOTHING,
+    held: RunInfo | None = None,
     hanging: Mapping[str, str] = MappingProxyType({}),
 ) -> list[JsonObject]:
     """Run every unfinished rollout and return all manifests in the plan's order.
@@ -124,7 +124,8 @@ def execute(
         on_done: Called with each manifest.
         notify: Called with one line for each damaged rollout, one each that says what is driven or
             scored again and why, and one for each failure that is kept.
-        held: What ``run.json`` said before; it names the files of what is driven again.
+        held: What ``run.json`` said before; it names the files of what is driven again. None: not
+            known.
         hanging: By policy what its check says, where it hung or died: such a policy is not driven.
     """
     work = _sort_cells(plan, root, how, on_done, notify, held, hanging)
@@ -177,7 +178,7 @@ def _sort_cells(
     how: HowToRun,
     on_done: OnDone,
     notify: Callable[[str], None],
-    held: JsonView,
+    held: RunInfo | None,
     hanging: Mapping[str, str],
 ) -> _Work:
     """Reuse or score again what the run folder holds, and list what is to be driven or copied; see

@@ -36,6 +36,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import copy_log
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
 from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.score_logs import check_vouched
@@ -84,7 +85,7 @@ def eval_config() -> dict[str, Any]:
     }
 
 
-def scenes_of(info: JsonView) -> dict[str, tuple[ScenarioRef, Scenario]]:
+def scenes_of(info: RunInfo) -> dict[str, tuple[ScenarioRef, Scenario]]:
     """Load the scenarios of a run by scene id.
 
     Args:
@@ -94,17 +95,16 @@ def scenes_of(info: JsonView) -> dict[str, tuple[ScenarioRef, Scenario]]:
         InputError: A scenario is gone, or is no longer the one that was driven.
     """
     out = {}
-    for scene_id, stated in info["scenes"].items():
-        stated_ref = stated.get("ref") or {}
-        if "path" not in stated_ref:
+    for scene_id, stated in info.scenes.items():
+        if stated.ref is None:
             raise InputError(
                 f"scene {scene_id!r}: run.json has no path of its scenario",
                 "export a folder that simrun run wrote",
             )
-        ref = ref_of(stated_ref)
+        ref = ref_of(stated.ref)
         require_installed([ref.source], f"scene {scene_id!r}")
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
-        if scenario.content_hash != stated["content_hash"]:
+        if scenario.content_hash != stated.content_hash:
             raise InputError(
                 f"scene {scene_id!r}: {ref.path} is not what was driven: its content has changed",
                 "run again, or restore the scenario",
@@ -222,7 +222,7 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
     """
     _check_free(out)
     info = read_run_json(root)
-    if info.get("kind") == "score":
+    if info.is_of_logs:
         raise InputError(
             f"{root}: scores of logs, without the logs",
             "export the run folder that holds them",
@@ -263,14 +263,14 @@ def _finish(
     folder: Path,
     out: Path,
     run: ExportedRun,
-    info: JsonView,
+    info: RunInfo,
     manifests: Sequence[JsonView],
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{run.renderer} {run.policy}"
     metadata = {
         "run_uuid": str(
-            uuid.uuid5(uuid.NAMESPACE_URL, f"{info.get('content')}/{run.renderer}/{run.policy}")
+            uuid.uuid5(uuid.NAMESPACE_URL, f"{info.content}/{run.renderer}/{run.policy}")
         ),
         "run_name": name,
     }

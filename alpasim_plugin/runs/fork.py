@@ -35,7 +35,7 @@ from alpasim_plugin.core.types import (
     SensorSpec,
     Trajectory,
 )
-from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 from alpasim_plugin.log.trace import first_difference
@@ -324,9 +324,13 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
         options,
     )
     write_run_info(root, plan, command, threads)
-    write_run_json(root, read_run_json(root) | {"kind": "fork", "fork": manifest.get("fork")})
-    pool = pool_of([original, manifest], threads, time.perf_counter() - began, None)
-    summary = finish_run(root, [original, manifest], {"pool": pool})
+    info = replace(
+        read_run_json(root),
+        kind="fork",
+        fork=manifest.get("fork"),
+        pool=pool_of([original, manifest], threads, time.perf_counter() - began, None),
+    )
+    summary = finish_run(root, info, [original, manifest])
     return RunResult(root, summary, 2, summary.failures.n_failed)
 
 

@@ -11,6 +11,7 @@ from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_r
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.log.run_folder.reader import Run
+from alpasim_plugin.log.run_folder.records import RunConfig
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, cell_name
 from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of
@@ -80,14 +81,14 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
             f"{name}: it is the continuation of another rollout",
             f"name that rollout: {manifest['fork']['of']}",
         )
-    stated: JsonView = (info["scenes"].get(row.scene) or {}).get("ref") or {}
-    if stated.get("path") is None:
+    stated = info.scenes.get(row.scene)
+    if stated is None or stated.ref is None or not isinstance(info.config, RunConfig):
         raise InputError(
             f"{root / RUN_INFO}: no path of the scenario {row.scene!r}",
             "Drive the rollout again with simrun run.",
         )
-    ref = ref_of(dict(stated))
-    options = replace(options_of(info), baseline=None, video="none")
+    ref = ref_of(stated.ref)
+    options = replace(options_of(info.config), baseline=None, video="none")
     own_parts = (row.renderer, row.policy, ref.source, options.controller)
     require_installed([*own_parts, *options.evaluators], root / RUN_INFO, named)
     # Fixer settings may belong to another renderer of the run; a plan refuses settings without a

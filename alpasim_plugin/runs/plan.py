@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,11 +15,11 @@ from alpasim_plugin.control import make_controller
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, digest, resolve, resolve_renderer
 from alpasim_plugin.core.parts.grammar import split_label
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder.records import RunConfig, SceneRef
 from alpasim_plugin.log.run_folder.schema import rollout_folder
 from alpasim_plugin.renderers.background import background_note
 from evaluators import resolve_evaluators
@@ -56,26 +56,23 @@ class RunOptions:
     ] = ()
 
 
-def options_of(info: JsonView) -> RunOptions:
+def options_of(config: RunConfig) -> RunOptions:
     """Return the options of an earlier run, as its ``run.json`` states them."""
-    stated = {
-        f.name: info["config"][f.name] for f in fields(RunOptions) if f.name in info["config"]
-    }
     return RunOptions(
-        **stated | {key: tuple(stated.get(key) or ()) for key in ("fixer", "evaluators")}
+        preset=config.preset,
+        images=config.images,
+        video=config.video,
+        device=config.device,
+        baseline=config.baseline,
+        fixer=config.fixer,
+        controller=config.controller,
+        evaluators=config.evaluators,
     )
 
 
-def ref_of(stated: JsonView) -> ScenarioRef:
-    """Return how a scenario was named when it was driven, as ``run.json`` states it in a scene's
-    ``ref``.
-    """
-    return ScenarioRef(
-        stated["path"],
-        stated.get("seed"),
-        tuple(stated.get("overrides") or ()),
-        stated.get("source"),
-    )
+def ref_of(stated: SceneRef) -> ScenarioRef:
+    """Return how a scenario was named when it was driven, as ``run.json`` states it."""
+    return ScenarioRef(stated.path, stated.seed, stated.overrides, stated.source)
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,19 @@
 """Check the user's policies before a run drives, for the pages of its failures."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.registry import entries
 from alpasim_plugin.core.parts.source import load
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario, SensorSpec
+from alpasim_plugin.log.run_folder.records import PolicyCheck
 from alpasim_plugin.runs.cameras import CameraRig
 from alpasim_plugin.runs.execute import HowToRun
 from alpasim_plugin.runs.guards import checked_sensors
@@ -54,10 +55,13 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
 
 
 def check_policies(
-    plan: RunPlan, earlier_checks: JsonView, how: HowToRun, noticed: Callable[[str], None]
-) -> JsonObject:
-    """Return what `policies.conformance.check_policy` finds in each policy of the user's own: its
-    digest, and by ``breaches`` and ``notes`` a name and a sentence each.
+    plan: RunPlan,
+    earlier_checks: Mapping[str, PolicyCheck],
+    how: HowToRun,
+    noticed: Callable[[str], None],
+) -> dict[str, PolicyCheck]:
+    """Return what `policies.conformance.check_policy` finds in each policy of the user's own,
+    by name.
 
     Of shipped policies the cameras alone are checked, and nothing of those behind an address. The
     time that a plan takes is no breach: a run need not keep it.
@@ -75,11 +79,11 @@ def check_policies(
     """
     shipped = {part.target for part in entries("policy").values() if part.is_shipped}
     scenarios = list(plan.scenarios.values())
-    checks: JsonObject = {}
+    checks: dict[str, PolicyCheck] = {}
     todo = []
     for policy in plan.policies:
         before = earlier_checks.get(policy.name)
-        if policy.digest is not None and before and before["digest"] == policy.digest:
+        if before is not None and policy.digest is not None and before.digest == policy.digest:
             checks[policy.name] = before
         elif policy.target in shipped:
             frames_asked(policy, scenarios)
@@ -89,25 +93,24 @@ def check_policies(
             _check_address(policy, scenarios)
     workers = min(how.threads.workers, len(todo))
     limit_s = how.limit_s or LIMIT_S
-    check = partial(_check, scenarios)
+    check_one = partial(_check, scenarios)
     threads = how.threads.per_worker
-    checked = run_jobs(check, todo, workers, threads, limit_s, parts_of=lambda policy: policy.name)
+    checked = run_jobs(
+        check_one, todo, workers, threads, limit_s, parts_of=lambda policy: policy.name
+    )
     for policy, result in checked:
         if isinstance(result, Lost):
             result = _of_lost(result, limit_s)
         if isinstance(result, InputError):
             raise result
-        checks[policy.name] = {"digest": policy.digest, **result}
+        checks[policy.name] = replace(result, digest=policy.digest)
     unmade = [
-        text
-        for facts in checks.values()
-        for name, text in facts["breaches"]
-        if name in NEVER_DRIVES
+        text for check in checks.values() for name, text in check.breaches if name in NEVER_DRIVES
     ]
     if len(unmade) == len(plan.policies):
         raise PolicyError(unmade[0], "Correct the policy; nothing was driven.")
     for policy in todo:
-        for _, sentence in checks[policy.name]["breaches"]:
+        for _, sentence in checks[policy.name].breaches:
             noticed(f"check of {policy.name}: {sentence}")
     return checks
 
@@ -123,19 +126,19 @@ def _check_address(policy: PartSpec, scenarios: Iterable[Scenario]) -> None:
         factory.check_scenario(scenario, policy.address)
 
 
-def hanging(checks: JsonView) -> dict[str, str]:
+def hanging(checks: Mapping[str, PolicyCheck]) -> dict[str, str]:
     """Return by policy what `check_policies` found, where it hung in the check or ended its
     process: what would drive it would hang, or end, as well.
     """
     return {
         policy: sentence
         for policy, check in checks.items()
-        for name, sentence in check["breaches"]
+        for name, sentence in check.breaches
         if name == HANGS
     }
 
 
-def _of_lost(lost: Lost, limit_s: float | None) -> JsonObject:
+def _of_lost(lost: Lost, limit_s: float | None) -> PolicyCheck:
     """Return what the check of a policy found whose process was lost."""
     sentence = f"the check did not end: {lost.reason}"
     name = "ends"
@@ -144,10 +147,10 @@ def _of_lost(lost: Lost, limit_s: float | None) -> JsonObject:
         sentence = culprit.error(lost.reason).message
         is_slow = lost.is_late and lost.hung_s < HUNG_SHARE * (limit_s or LIMIT_S)
         name = name if is_slow else HANGS
-    return {"breaches": [[name, sentence]], "notes": []}
+    return PolicyCheck(None, breaches=((name, sentence),))
 
 
-def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> JsonObject | InputError:
+def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> PolicyCheck | InputError:
     """Check one policy, in a worker."""
     try:
         with parts_print_to_stderr():
@@ -157,7 +160,10 @@ def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> JsonObject | Inpu
     except InputError as error:
         return error
     except SimrunError as error:
-        return {"breaches": [["made", error.message]], "notes": []}
-    breaches = [one for one in report.checks if not one.ok and one.name != "latency"]
-    kinds = {"breaches": breaches, "notes": report.notes}
-    return {kind: [[one.name, one.sentence] for one in of_kind] for kind, of_kind in kinds.items()}
+        return PolicyCheck(None, breaches=(("made", error.message),))
+    breaches = [check for check in report.checks if not check.ok and check.name != "latency"]
+    return PolicyCheck(
+        None,
+        breaches=tuple((check.name, check.sentence) for check in breaches),
+        notes=tuple((note.name, note.sentence) for note in report.notes),
+    )

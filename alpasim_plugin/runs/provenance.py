@@ -10,11 +10,12 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TypedDict
 
 from alpasim_plugin import __version__
 from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.log.run_folder.records import PartFacts, Project
 from evaluators.results import FixerFacts
 
 PACKAGES = (
@@ -79,19 +80,19 @@ def _cpu_name() -> str:
     return platform.processor() or "unknown"
 
 
-class Project(TypedDict):
-    """What ``run.json`` says of the project.
-
-    Attributes:
-        commit: Full hash of the commit; None where there is none.
-        dirty: Whether a file that git follows differs from the commit; files that it does not
-            follow do not count, nor do changes in submodules.
-        reason: Why there is no commit, else empty.
-    """
-
-    commit: str | None
-    dirty: bool | None
-    reason: str
+def part_facts(part: PartSpec) -> PartFacts:
+    """Return what ``run.json`` says of a part."""
+    return PartFacts(
+        name=part.name,
+        target=part.target,
+        label=part.label,
+        digest=part.digest,
+        trained=part.trained,
+        files=dict(part.files),
+        code=dict(part.code),
+        unseen=part.unseen,
+        settings=None if part.settings is None else part.settings.model_dump(mode="json"),
+    )
 
 
 def project(folder: Path | None = None) -> Project:
@@ -109,7 +110,7 @@ def project(folder: Path | None = None) -> Project:
     if stated:
         if not _COMMIT.fullmatch(stated):
             return _without(f"{VARIABLE} is no commit: {stated[:40]!r}")
-        return {"commit": stated, "dirty": None, "reason": ""}
+        return Project(commit=stated, dirty=None, reason="")
     try:
         commit = _git(folder, "rev-parse", "--verify", "HEAD").strip()
         state = _git(
@@ -127,11 +128,11 @@ def project(folder: Path | None = None) -> Project:
     except subprocess.CalledProcessError as error:
         error_lines = str(error.stderr or "").strip().splitlines()
         return _without(error_lines[0] if error_lines else f"git ended with {error.returncode}")
-    return {"commit": commit, "dirty": bool(state.strip()), "reason": ""}
+    return Project(commit=commit, dirty=bool(state.strip()), reason="")
 
 
 def _without(reason: str) -> Project:
-    return {"commit": None, "dirty": None, "reason": reason}
+    return Project(commit=None, dirty=None, reason=reason)
 
 
 def _git(folder: Path | None, *words: str) -> str:

@@ -189,16 +189,18 @@ def _label(name: str, taken: Sequence[str]) -> str:
 
 def _facts(run: Run, cell: WatchedCell) -> dict[str, str]:
     """Return where the recording comes from."""
+    project = run.info.project
+    scene = run.info.scenes.get(cell.scene)
     facts = {
         "run": real(run.folder).name,
-        "key": run.info.get("key"),
+        "key": run.info.key,
         "scene": cell.scene,
         "policy": cell.policy,
         "seed": cell.seed,
-        "preset": run.info.get("preset"),
-        "simrun": run.info.get("version"),
-        "commit": run.info.get("project", {}).get("commit"),
-        "content_hash": run.info["scenes"].get(cell.scene, {}).get("content_hash"),
+        "preset": run.info.preset,
+        "simrun": run.info.version,
+        "commit": None if project is None else project.commit,
+        "content_hash": None if scene is None else scene.content_hash,
     }
     return {key: str(value) for key, value in facts.items() if value not in (None, "")}
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.files.atomic import scratch_folder
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
-from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME
+from alpasim_plugin.log.run_folder.records import CellNames, LogDifference, Repeat
+from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, cell_name
 from alpasim_plugin.log.trace import Trace, first_difference, trace_log
 from alpasim_plugin.runs.cell import run_cell, users_parts
 from alpasim_plugin.runs.local_executor import apart
@@ -23,7 +24,7 @@ def log_trace(folder: Path) -> Trace:
 
 def repeat_rollout(
     plan: RunPlan, root: Path, manifests: Sequence[JsonView], threads: int
-) -> JsonObject:
+) -> Repeat:
     """Drive the shortest finished rollout of each policy again and compare the two logs.
 
     Times that depend on the clock are no part of the comparison. Rollouts whose latency is measured
@@ -37,8 +38,7 @@ def repeat_rollout(
 
     Returns:
         Of the first policy that is not repeatable, else of one that could not be compared, else of
-        any: ``repeatable`` (None where nothing could be compared), ``reason`` for None, ``cell``,
-        ``digests`` of the two logs, and ``first_difference`` (component, t_us, step, what) or None.
+        any.
     """
     finished = [
         cell
@@ -56,10 +56,10 @@ def repeat_rollout(
     if not shortest:
         return _not_compared("no rollout with a fixed latency has finished")
     comparisons = [_driven_twice(plan, root, cell, threads) for cell in shortest.values()]
-    return min(comparisons, key=lambda result: (False, None, True).index(result["repeatable"]))
+    return min(comparisons, key=lambda result: (False, None, True).index(result.repeatable))
 
 
-def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonObject:
+def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> Repeat:
     folder = root / cell.folder
     with scratch_folder(root / "repeat") as scratch:
         work = partial(run_cell, options=plan.options, root=scratch.absolute(), threads=threads)
@@ -77,30 +77,32 @@ def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> JsonOb
         ]
     scenario = plan.scenarios[cell.scene]
     difference = first_difference(first, second, scenario.start_us, scenario.rates.control_us)
-    return {
-        "repeatable": difference is None and digests[0] == digests[1],
-        "cell": dict(cell.names),
-        "digests": digests,
-        "first_difference": difference,
-    }
+    return Repeat(
+        repeatable=difference is None and digests[0] == digests[1],
+        cell=CellNames(cell.renderer.name, cell.policy.name, cell.scene, cell.seed),
+        digests=tuple(digests),
+        first_difference=None if difference is None else LogDifference(**difference),
+    )
 
 
-def repeat_line(repeat: JsonView) -> str:
+def repeat_line(repeat: Repeat) -> str:
     """Return the result of a repeated rollout as one line of text.
 
     Example:
-        >>> repeat_line({"repeatable": None, "reason": "no rollout has finished"})
+        >>> repeat_line(Repeat(None, reason="no rollout has finished"))
         'not compared: no rollout has finished'
     """
-    if repeat["repeatable"] is None:
-        return f"not compared: {repeat['reason']}"
-    cell = "/".join(map(str, repeat["cell"].values()))
-    if repeat["repeatable"]:
+    if repeat.cell is None:
+        return f"not compared: {repeat.reason}"
+    cell = cell_name(repeat.cell.renderer, repeat.cell.policy, repeat.cell.scene, repeat.cell.seed)
+    if repeat.repeatable:
         return f"repeatable: {cell} was driven twice with equal logs"
-    difference = repeat["first_difference"] or {"component": "log", "step": None}
-    step = "" if difference["step"] is None else f" at step {difference['step']}"
-    return f"NOT repeatable: {cell} was driven twice and differs first in {difference['component']}{step}"
+    difference = repeat.first_difference or LogDifference("log")
+    step = "" if difference.step is None else f" at step {difference.step}"
+    return (
+        f"NOT repeatable: {cell} was driven twice and differs first in {difference.component}{step}"
+    )
 
 
-def _not_compared(reason: str) -> JsonObject:
-    return {"repeatable": None, "reason": reason}
+def _not_compared(reason: str) -> Repeat:
+    return Repeat(None, reason=reason)

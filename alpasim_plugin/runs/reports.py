@@ -39,7 +39,7 @@ def write_reports(root: Path, page: bool = True) -> Path | None:
             returned.
     """
     run = read_run(root)
-    if page and run.info.get("kind") != "score":
+    if page and not run.info.is_of_logs:
         write_flips(run)
         failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
         for rollout in list(failed.values())[::-1][:MAX_CAUSES]:

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -12,14 +12,20 @@ from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real, some_of
-from alpasim_plugin.core.json_types import JsonObject, JsonView
-from alpasim_plugin.core.parts import PartSpec
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
 from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
+from alpasim_plugin.log.run_folder.records import (
+    RunConfig,
+    RunCounts,
+    RunInfo,
+    SceneFacts,
+    SceneRef,
+)
 from alpasim_plugin.log.run_folder.schema import (
     DECISION,
     FILES,
@@ -40,7 +46,7 @@ from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import prepare_workers
 from alpasim_plugin.runs.plan import RunPlan
 from alpasim_plugin.runs.policy_checks import check_policies, hanging
-from alpasim_plugin.runs.provenance import hardware, project, versions
+from alpasim_plugin.runs.provenance import hardware, part_facts, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
 from alpasim_plugin.runs.same_poses import store_same_poses
 from alpasim_plugin.runs.summary import pool_of, write_summary
@@ -50,7 +56,6 @@ from evaluators.statistics.decision import State
 from evaluators.statistics.verdicts import outcome_of_failures
 from scenarios.suite import ScenarioRef
 
-SCHEMA_VERSION = 1
 OF_A_RUN = {LOCK, ROLLOUTS_FOLDER, SCENES, STAGES, FILES, DECISION, *TABLES, *REPORTS}
 SHORT_KEY = 4  # letters in the name of a run folder
 
@@ -111,8 +116,8 @@ class Search(Protocol):
         """Return the plan of what was driven, in the order of the tables."""
         ...
 
-    def facts(self) -> JsonObject:
-        """Return what ``run.json`` and the summary hold of the search."""
+    def stated_in(self, info: RunInfo) -> RunInfo:
+        """Return ``run.json`` with what it and the summary hold of the search."""
         ...
 
 
@@ -155,7 +160,7 @@ def default_folder(plan: RunPlan) -> Path:
     key = plan.command_key
     short = Path("runs", f"{name}-{key[:SHORT_KEY]}")
     try:
-        is_free = not os.path.exists(short / RUN_INFO) or read_run_json(short).get("key") == key
+        is_free = not os.path.exists(short / RUN_INFO) or read_run_json(short).key == key
     except InputError:
         is_free = True  # `claim` writes a damaged description again
     return short if is_free else Path("runs", f"{name}-{key}")
@@ -200,23 +205,26 @@ def execute_run(
         how = HowToRun(threads, resume, limit_s, executor)
         if executor.is_local and (threads.workers > 1 or any(map(users_parts, plan.cells))):
             prepare_workers(threads.per_worker)
-        earlier_checks = held.get("policy_checks") or {}
+        earlier_checks = {} if held is None else held.policy_checks
+        earlier_pool = None if held is None else held.pool
         try:
             checks = check_policies(plan, earlier_checks, how, progress.noticed)
             manifests = execute(
                 plan, root, how, on_done(progress), progress.noticed, held, hanging(checks)
             )
             wall_s = time.perf_counter() - began
-            more: JsonObject = {
-                "pool": {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))},
-                "policy_checks": checks,
-            }
+            info = replace(
+                read_run_json(root),
+                pool=pool_of(manifests, threads, wall_s, earlier_pool, how.stated),
+                policy_checks=checks,
+            )
             if repeat:
-                more["repeat"] = repeat_rollout(plan, root, manifests, how.local_cores)
+                repeated = repeat_rollout(plan, root, manifests, how.local_cores)
+                info = replace(info, repeat=repeated)
             store_same_poses(plan, root, manifests, how.local_cores)
         finally:
             end_children()
-        summary = finish_run(root, manifests, more, report)
+        summary = finish_run(root, info, manifests, report)
     return RunResult(root, summary, len(manifests), summary.failures.n_failed)
 
 
@@ -237,7 +245,7 @@ def execute_search(
     with writing(root):
         held = claim(root, search.plan, command, threads, False, progress.noticed)
         # The kind is written at once: the plan's scenes are not all wanted.
-        write_run_json(root, read_run_json(root) | {"kind": search.kind})
+        write_run_json(root, replace(read_run_json(root), kind=search.kind))
         progress.started(search.ceiling, root, threads)
         began = time.perf_counter()
         try:
@@ -249,16 +257,22 @@ def execute_search(
         driven = search.driven_plan()
         manifests = [search.driven[cell.folder.as_posix()] for cell in driven.cells]
         wall_s = time.perf_counter() - began
-        pool = {**how.stated, **pool_of(manifests, threads, wall_s, held.get("pool"))}
-        write_run_info(root, driven, command, threads)  # again, with the scenes that were driven
-        kept = {key: held[key] for key in ("started_at",) if key in held}
-        write_run_json(root, read_run_json(root) | kept | {"kind": search.kind})
-        summary = finish_run(root, manifests, {"pool": pool} | search.facts(), report)
+        earlier_pool = None if held is None else held.pool
+        # Again, with the scenes that were driven.
+        info = replace(
+            run_info(driven, command, threads),
+            kind=search.kind,
+            pool=pool_of(manifests, threads, wall_s, earlier_pool, how.stated),
+        )
+        if held is not None and held.started_at is not None:
+            info = replace(info, started_at=held.started_at)
+        _write_scenes(root, driven)
+        summary = finish_run(root, search.stated_in(info), manifests, report)
     return RunResult(root, summary, len(manifests), summary.failures.n_failed)
 
 
 def finish_run(
-    root: Path, manifests: Sequence[JsonObject], more: JsonView, report: bool = True
+    root: Path, info: RunInfo, manifests: Sequence[JsonObject], report: bool = True
 ) -> Summary:
     """Write the tables and the reports of a run whose rollouts are done; return the summary.
 
@@ -266,25 +280,21 @@ def finish_run(
 
     Args:
         root: The run folder.
+        info: ``run.json``, which is written with the outcome; it holds all that the tables need
+            beside the manifests, so that they can be made again.
         manifests: One per rollout, in the order of the tables.
-        more: Facts of the run that its manifests do not hold; kept in ``run.json``, so that the
-            tables can be made again.
         report: Write ``report.html``.
     """
-    info = read_run_json(root) | dict(more)
-    # for lists of many runs
-    info["outcome"] = {
-        "n_rollouts": len(manifests),
-        "n_failed": sum(manifest["status"] != "ok" for manifest in manifests),
-    }
-    folders = [manifest["path"] for manifest in manifests]
-    info.pop("rollouts", None)
-    if tuple(folders) != cells_of_run(info):
-        info["rollouts"] = folders
+    n_failed = sum(manifest["status"] != "ok" for manifest in manifests)
+    outcome = RunCounts(len(manifests), n_failed)  # for lists of many runs
+    info = replace(info, outcome=outcome, rollouts=None)
+    folders = tuple(manifest["path"] for manifest in manifests)
+    if folders != cells_of_run(info):
+        info = replace(info, rollouts=folders)
     write_run_json(root, info)
     REMADE.pop(real(root), None)
     summary = write_summary(root, info, manifests, root)
-    scenes = [f"{SCENES}/{slug(scene)}.json" for scene in info["scenes"]]
+    scenes = [f"{SCENES}/{slug(scene)}.json" for scene in info.scenes]
     state_files(root, [RUN_INFO, DECISION, *TABLES, *scenes])
     from alpasim_plugin.runs.reports import write_reports  # templates: only once all is driven
 
@@ -299,16 +309,16 @@ def claim(
     threads: Threads,
     resume: bool,
     noticed: Callable[[str], None],
-) -> JsonObject:
+) -> RunInfo | None:
     """Write ``run.json`` and the scene files, or check that the folder holds this run.
 
     Returns:
-        What ``run.json`` said before; empty for a new folder, or where it was damaged.
+        What ``run.json`` said before; None for a new folder, or where it was damaged.
 
     Raises:
         InputError: The folder holds another run, or other files.
     """
-    held: JsonObject = {}
+    held: RunInfo | None = None
     foreign = sorted(set(os.listdir(root)) - OF_A_RUN)
     if os.path.exists(root / RUN_INFO):
         try:
@@ -319,18 +329,18 @@ def claim(
         raise InputError(
             f"The folder {root} holds no run but {some_of(foreign)}.", "Name a new or empty folder."
         )
-    if held and held.get("key") != plan.command_key and not resume:
+    if held is not None and held.key != plan.command_key and not resume:
         raise InputError(
-            f"The folder {root} holds another run: its key is {held.get('key')}, this command's "
+            f"The folder {root} holds another run: its key is {held.key}, this command's "
             f"is {plan.command_key}.",
             "Choose another --out, or, without --vary, pass --resume to reuse its matching "
             "rollouts and replace its tables.",
         )
-    if held and any(damage.file == RUN_INFO for damage in inspect_files(root)):
+    if held is not None and any(damage.file == RUN_INFO for damage in inspect_files(root)):
         noticed(f"damaged: {root / RUN_INFO}: not the content that was written; writing it again")
-        held = {}
+        held = None
     unfinish(root)
-    if held.get("content") != plan.content:
+    if held is None or held.content != plan.content:
         write_run_info(root, plan, command, threads)
     else:
         _write_scenes(root, plan)
@@ -345,75 +355,69 @@ def _write_scenes(root: Path, plan: RunPlan) -> None:
 def write_run_info(root: Path, plan: RunPlan, command: Sequence[str], threads: Threads) -> None:
     """Write ``run.json`` and the scene files of the report."""
     _write_scenes(root, plan)
+    write_run_json(root, run_info(plan, command, threads))
+
+
+def run_info(plan: RunPlan, command: Sequence[str], threads: Threads) -> RunInfo:
+    """Return ``run.json`` of a plan of which nothing is driven yet."""
     refs = {cell.scene: cell.ref for cell in plan.cells}
-    fixed = [spec for spec in plan.renderers if spec.fixer is not None]
     parts = plan.parts
-    write_run_json(
-        root,
-        {"schema_version": SCHEMA_VERSION, "key": plan.command_key, "content": plan.content}
-        | origin_of(command)
-        | {
-            "asked": list(plan.scenario_names),
-            "config": asdict(plan.options)
-            | {"workers": threads.workers, "threads_per_worker": threads.per_worker},
-            "preset": plan.options.preset,
-            "renderers": [spec.name for spec in plan.renderers],
-            "policies": [spec.name for spec in plan.policies],
-            "seeds": list(plan.seeds),
-            "scenes": {
-                name: _scene_facts(scenario, refs[name], plan.options.device)
-                for name, scenario in plan.scenarios.items()
-            },
-            "bases": {spec.name: spec.base.name for spec in fixed},
-            "fixers": {spec.name: spec.fixer.as_dict() for spec in fixed if spec.fixer is not None},
-            **stated_parts(parts),
-            "code": {"loop": package_digest()[:12], "scoring": package_digest()[:12]},
-            "metrics": table_of(parts).as_dict(),
-            "weights": {file: sha for part in parts for file, sha in part.files.items()},
-            "hardware": hardware(),
-            "versions": versions(),
-            "left_out": sorted(
-                {note for scenario in plan.scenarios.values() for note in scenario.notes}
-            ),
+    fixers = {spec.name: spec.fixer for spec in plan.renderers if spec.fixer is not None}
+    code = package_digest()[:12]
+    left_out = {note for scenario in plan.scenarios.values() for note in scenario.notes}
+    return RunInfo(
+        key=plan.command_key,
+        command=tuple(command),
+        config=RunConfig(
+            **vars(plan.options),
+            workers=threads.workers,
+            threads_per_worker=threads.per_worker,
+        ),
+        preset=plan.options.preset,
+        renderers=tuple(spec.name for spec in plan.renderers),
+        policies=tuple(spec.name for spec in plan.policies),
+        seeds=plan.seeds,
+        scenes={
+            name: _scene_facts(scenario, refs[name], plan.options.device)
+            for name, scenario in plan.scenarios.items()
         },
+        content=plan.content,
+        version=__version__,
+        started_at=now(),
+        project=project(),
+        asked=plan.scenario_names,
+        bases={spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
+        fixers={name: part_facts(fixer) for name, fixer in fixers.items()},
+        parts={f"{part.kind} {part.name}": part_facts(part) for part in parts},
+        code={"loop": code, "scoring": code},
+        metrics=dict(table_of(parts)),
+        unseen={f"{part.kind} {part.name}": part.unseen for part in parts if part.unseen},
+        weights={file: sha for part in parts for file, sha in part.files.items()},
+        hardware=hardware(),
+        versions=versions(),
+        left_out=tuple(sorted(left_out)),
     )
 
 
-def stated_parts(parts: Sequence[PartSpec]) -> JsonObject:
-    """Return what ``run.json`` says of parts: what they are, and what of them no key can hold."""
-    named = {f"{part.kind} {part.name}": part for part in parts}
-    return {
-        "parts": {name: part.as_dict() for name, part in named.items()},
-        "unseen": {name: part.unseen for name, part in named.items() if part.unseen},
-    }
+def now() -> str:
+    """Return date and time in UTC, as ``run.json`` states them."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def origin_of(command: Sequence[str]) -> JsonObject:
-    """Return what ``run.json`` says of how a run folder came about: command, version, time, the
-    user's project.
-    """
-    return {
-        "command": list(command),
-        "version": __version__,
-        "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "project": project(),
-    }
-
-
-def _scene_facts(scenario: Scenario, ref: ScenarioRef, device: str) -> JsonObject:
-    return {
-        "source": scenario.source,
-        "ref": vars(ref) | {"path": str(Path(ref.path).absolute())},
-        "content_hash": scenario.content_hash,
-        "files": dict(scenario.files),
-        "seed": scenario.seed,
-        "varied": {key: list(values) for key, values in scenario.varied.items()},
-        "duration_s": (scenario.end_us - scenario.start_us) * 1e-6,
-        "rates": asdict(scenario.rates),
-        "latency": asdict(scenario.latency),
-        "degradation": asdict(scenario.degradation),
-        "environment": asdict(scenario.environment),
-        "vehicle": asdict(scenario.vehicle),
-        "reconstruction": model_key(scenario, device),
-        "notes": list(scenario.notes),
-    }
+def _scene_facts(scenario: Scenario, ref: ScenarioRef, device: str) -> SceneFacts:
+    return SceneFacts(
+        source=scenario.source,
+        ref=SceneRef(str(Path(ref.path).absolute()), ref.seed, ref.overrides, ref.source),
+        content_hash=scenario.content_hash,
+        files=dict(scenario.files),
+        seed=scenario.seed,
+        varied={key: list(values) for key, values in scenario.varied.items()},
+        duration_s=(scenario.end_us - scenario.start_us) * 1e-6,
+        rates=asdict(scenario.rates),
+        latency=asdict(scenario.latency),
+        degradation=asdict(scenario.degradation),
+        environment=asdict(scenario.environment),
+        vehicle=asdict(scenario.vehicle),
+        reconstruction=model_key(scenario, device),
+        notes=tuple(scenario.notes),
+    )

@@ -1,25 +1,34 @@
 """Score logs into a run folder: run.json, the tables, the reports, and AlpaSim's aggregation."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.files import file_sha256, real, some_of
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
+from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
+from alpasim_plugin.log.run_folder.records import RunInfo, SceneFacts, ScoreConfig
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
-from alpasim_plugin.log.run_folder.writer import unfinish, write_parquet, write_scene, writing
+from alpasim_plugin.log.run_folder.writer import (
+    LoggedScene,
+    unfinish,
+    write_parquet,
+    write_scene,
+    writing,
+)
 from alpasim_plugin.runs.changes import changed_evaluators
 from alpasim_plugin.runs.execute import Threads
-from alpasim_plugin.runs.provenance import hardware, versions
-from alpasim_plugin.runs.run import SCHEMA_VERSION, finish_run, origin_of, stated_parts
+from alpasim_plugin.runs.provenance import hardware, part_facts, project, versions
+from alpasim_plugin.runs.run import finish_run, now
 from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, score_logs
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.alpasim import (
@@ -95,31 +104,34 @@ def execute_score(
     key = digest(facts)[:12]
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
-        held: JsonObject = {}
+        held: RunInfo | None = None
         with suppress(InputError):  # a damaged run.json is written again
             held = read_run_json(root)
-        if held.get("key", key) != key:
+        if held is not None and held.key != key:
             raise InputError(
-                f"{root}: the folder holds other results (key {held['key']})",
+                f"{root}: the folder holds other results (key {held.key})",
                 "Name another --out.",
             )
-        changes = changed_evaluators(held.get("parts") or {}, evaluators)
+        changes = changed_evaluators({} if held is None else held.parts, evaluators)
         if changes:
             noticed(f"scored again: {some_of(changes)}")
         unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
-        more: JsonObject = {}
+        aggregation: JsonObject | None = None
         error: EvaluatorError | None = None
         if settings is not None:
-            more["alpasim"], error = _aggregate(scores, preset, settings, root / AGGREGATE)
+            aggregation, error = _aggregate(scores, preset, settings, root / AGGREGATE)
         manifests = [one.manifest for one in scores]
         for manifest in manifests:
             write_manifest(root / manifest["path"], manifest)
-        _write_info(root, key, scores, scenes, preset, settings, command, evaluators)
+        used = _write_scenes(root, scores, scenes)
+        info = _run_info(key, scores, used, preset, settings, command, evaluators)
+        write_run_json(root, info)
         allowed = settings is not None and settings.allow_aggregation_with_failed_rollouts
         code = exit_code(scores, allowed, error)
-        more["pool"] = pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None)
-        summary = finish_run(root, manifests, more | {"exit_code": code})
+        pool = pool_of(manifests, Threads(1, 1), time.perf_counter() - began, None)
+        info = replace(info, alpasim=aggregation, pool=pool, exit_code=code)
+        summary = finish_run(root, info, manifests)
     return ScoreResult(root, summary, code)
 
 
@@ -210,16 +222,10 @@ def _write_aggregate(
     return [*files, "results-summary.json"]
 
 
-def _write_info(
-    root: Path,
-    key: str,
-    scores: Sequence[LogScore],
-    scenes: KnownScenes,
-    preset: Preset,
-    settings: EvalSettings | None,
-    command: Sequence[str],
-    evaluators: Sequence[PartSpec],
-) -> None:
+def _write_scenes(
+    root: Path, scores: Sequence[LogScore], scenes: KnownScenes
+) -> dict[str, Scenario | LoggedScene]:
+    """Write the files of the scenes in which logs were scored, and return them by id."""
     used = {
         log_score.manifest["scene"]: scenes.of(log_score.manifest["scene"])
         for log_score in scores
@@ -227,40 +233,49 @@ def _write_info(
     }
     for scene in used.values():
         write_scene(root, scene)
+    return used
 
-    def names(column: str) -> list[Any]:
-        return list(dict.fromkeys(log_score.manifest[column] for log_score in scores))
 
-    write_run_json(
-        root,
-        {
-            **origin_of(command),
-            "schema_version": SCHEMA_VERSION,
-            "kind": "score",
-            "key": key,
-            "config": {
-                "preset": preset.as_dict(),
-                "settings": None if settings is None else settings.model_dump(mode="json"),
-            },
-            "preset": preset.name,
-            "renderers": names("renderer"),
-            "policies": names("policy"),
-            "seeds": names("seed"),
-            "logs": names("log"),
-            "scenes": {
-                name: {
-                    "source": scene.source,
-                    "content_hash": scene.content_hash,
-                    "notes": list(scene.notes),
-                }
-                for name, scene in used.items()
-            },
-            "code": {"scoring": package_digest()[:12]},
-            "metrics": table_of(evaluators).as_dict(),
-            **stated_parts(evaluators),
-            "weights": {},
-            "hardware": hardware(),
-            "versions": versions(),
-            "left_out": sorted({note for scene in used.values() for note in scene.notes}),
+def _run_info(
+    key: str,
+    scores: Sequence[LogScore],
+    scenes: Mapping[str, Scenario | LoggedScene],
+    preset: Preset,
+    settings: EvalSettings | None,
+    command: Sequence[str],
+    evaluators: Sequence[PartSpec],
+) -> RunInfo:
+    manifests = [log_score.manifest for log_score in scores]
+    left_out = {note for scene in scenes.values() for note in scene.notes}
+    return RunInfo(
+        key=key,
+        command=tuple(command),
+        config=ScoreConfig(
+            preset=preset.as_dict(),
+            settings=None if settings is None else settings.model_dump(mode="json"),
+        ),
+        preset=preset.name,
+        renderers=tuple(dict.fromkeys(manifest["renderer"] for manifest in manifests)),
+        policies=tuple(dict.fromkeys(manifest["policy"] for manifest in manifests)),
+        seeds=tuple(dict.fromkeys(manifest["seed"] for manifest in manifests)),
+        scenes={
+            name: SceneFacts(
+                source=scene.source,
+                content_hash=scene.content_hash,
+                notes=tuple(scene.notes),
+            )
+            for name, scene in scenes.items()
         },
+        kind="score",
+        version=__version__,
+        started_at=now(),
+        project=project(),
+        code={"scoring": package_digest()[:12]},
+        metrics=dict(table_of(evaluators)),
+        parts={f"{part.kind} {part.name}": part_facts(part) for part in evaluators},
+        unseen={f"{part.kind} {part.name}": part.unseen for part in evaluators if part.unseen},
+        hardware=hardware(),
+        versions=versions(),
+        left_out=tuple(sorted(left_out)),
+        logs=tuple(dict.fromkeys(manifest["log"] for manifest in manifests)),
     )

@@ -16,13 +16,14 @@ from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, require_installed
 from alpasim_plugin.core.path_end import ends_with_path
 from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.log.run_folder.records import SceneFacts
 from alpasim_plugin.log.run_folder.schema import (
     KEYS,
     LOG_NAME,
@@ -378,11 +379,12 @@ class KnownScenes:
         if log is None and scene_id in self._used:
             return self._used[scene_id]
         stated = None if log is None else _stated_scene(log, scene_id)
-        ref = self._ref(scene_id, None if stated is None else ref_of(stated["ref"]))
+        driven = None if stated is None or stated.ref is None else ref_of(stated.ref)
+        ref = self._ref(scene_id, driven)
         if ref not in self._read:
             self._read[ref] = _read_scene(ref, is_ours=stated is not None)
         scene = self._read[ref]
-        if stated is not None and scene.content_hash != stated["content_hash"]:
+        if stated is not None and scene.content_hash != stated.content_hash:
             raise InputError(
                 f"scene {scene_id!r}: {ref.path} is not what was driven: its content has changed",
                 "give the scenario as it was driven, or run again",
@@ -421,16 +423,17 @@ class KnownScenes:
         )
 
 
-def _stated_scene(log: Path, scene_id: str) -> JsonView | None:
+def _stated_scene(log: Path, scene_id: str) -> SceneFacts | None:
     """Return what the run of a log states of the scene that was driven; None for a log of another
     program.
     """
     root = next((folder for folder in real(log).parents if os.path.exists(folder / RUN_INFO)), None)
     if root is None or not os.path.exists(log.parent / MANIFEST):
         return None
-    stated: JsonView = read_run_json(root)["scenes"].get(scene_id) or {}
-    has_path = "path" in (stated.get("ref") or {})
-    return stated if has_path and "content_hash" in stated else None
+    stated = read_run_json(root).scenes.get(scene_id)
+    if stated is None or stated.ref is None or not stated.content_hash:
+        return None
+    return stated
 
 
 def _read_scene(ref: ScenarioRef, is_ours: bool) -> Scenario | LoggedScene:

@@ -5,6 +5,7 @@ manifests and tables.
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ import pyarrow as pa
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
 from alpasim_plugin.core.files.atomic import write_json
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
+from alpasim_plugin.log.run_folder.records import Pool, RunInfo
 from alpasim_plugin.log.run_folder.rows import rollouts_of_table
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, SUMMARY
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
@@ -27,7 +29,6 @@ from evaluators.metrics import MetricTable
 from evaluators.results import (
     FailedRollout,
     Failures,
-    Pool,
     RolloutError,
     Speed,
     StageSpeed,
@@ -40,7 +41,7 @@ from evaluators.statistics.variants import base_named, variants_in
 
 
 def write_summary(
-    root: Path, info: JsonView, manifests: Sequence[JsonObject], tables: Path
+    root: Path, info: RunInfo, manifests: Sequence[JsonObject], tables: Path
 ) -> Summary:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
@@ -56,7 +57,7 @@ def write_summary(
     return summary
 
 
-def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Table) -> Summary:
+def summary_of(info: RunInfo, manifests: Sequence[JsonObject], rollouts: pa.Table) -> Summary:
     """Return the results of a run.
 
     Args:
@@ -64,20 +65,19 @@ def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Tab
         manifests: One per rollout, in the order of the tables.
         rollouts: The content of ``rollouts.parquet``.
     """
-    metric_table = MetricTable.of_run(info)
+    metric_table = MetricTable.of_run(info.metrics)
     reasons = _invalid_reasons(manifests)
     table = RolloutTable.of_table(
         rollouts, lambda renderer, metric: reasons.get((renderer, metric), "")
     )
-    means = numbers(table, info["config"].get("baseline"), info.get("bases") or {}, metric_table)
+    means = numbers(table, info.baseline, info.bases, metric_table)
     of_policy = _of_policies(manifests)
     finished = {
         policy: [manifest for manifest in policy_manifests if manifest["status"] == "ok"]
         for policy, policy_manifests in of_policy.items()
     }
-    pool = info.get("pool")
     return Summary(
-        preset=info["preset"],
+        preset=info.preset,
         metrics=means.metrics,
         paired=means.paired,
         paired_with_base=means.paired_with_base,
@@ -97,11 +97,11 @@ def summary_of(info: JsonView, manifests: Sequence[JsonObject], rollouts: pa.Tab
         speed=by_policy(
             {policy: _speeds(policy_manifests) for policy, policy_manifests in finished.items()}
         ),
-        pool=None if pool is None else Pool(**pool),
-        repeat=info.get("repeat"),
-        exit_code=info.get("exit_code"),
-        alpasim=info.get("alpasim"),
-        boundary=info.get("boundary"),
+        pool=info.pool,
+        repeat=info.repeat,
+        exit_code=info.exit_code,
+        alpasim=info.alpasim,
+        boundary=info.boundary,
     )
 
 
@@ -200,22 +200,32 @@ def pool_of(
     manifests: Sequence[JsonObject],
     threads: Threads,
     wall_s: float,
-    before: JsonView | None,
-) -> JsonView:
+    before: Pool | None,
+    executor: str | None = None,
+) -> Pool:
     """Return the throughput of all workers together, start-up included; a run that only reused
     rollouts keeps its earlier figures.
+
+    Args:
+        manifests: One per rollout.
+        threads: Workers, and threads of each.
+        wall_s: Seconds.
+        before: What the folder says so far.
+        executor: Where rollouts ran; None: on this machine.
     """
     fresh = [m for m in manifests if not m.get("reused")]
-    if not fresh and before:
-        return before
+    if not fresh and before is not None:
+        return replace(before, executor=before.executor or executor)
     frames = sum(int(m.get("frames") or 0) for m in fresh)
-    return {
-        "workers": threads.workers,
-        "threads_per_worker": threads.per_worker,
-        "wall_s": round(wall_s, 3),
-        "frames": frames,
-        "frames_per_s_total": round(frames / wall_s, 2) if frames and wall_s > 0 else None,
-    }
+    has_speed = frames > 0 and wall_s > 0
+    return Pool(
+        workers=threads.workers,
+        threads_per_worker=threads.per_worker,
+        wall_s=round(wall_s, 3),
+        frames=frames,
+        frames_per_s_total=round(frames / wall_s, 2) if has_speed else None,
+        executor=executor,
+    )
 
 
 def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> Summary:
@@ -237,7 +247,7 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> Summary
     for number, run in enumerate(runs):
         if real(run) in {real(other) for other in runs[:number]}:
             raise InputError(f"{run}: named twice", "Name every run once.")
-    infos: dict[Path, JsonObject] = {}
+    infos: dict[Path, RunInfo] = {}
     for run in runs:
         infos[run] = read_run_json(run)
         if not os.path.isfile(table_path(run, SUMMARY)):
@@ -248,13 +258,11 @@ def aggregate_runs(runs: Sequence[Path], baseline: str | None = None) -> Summary
     if baseline is not None:
         base_named(baseline, variants_in(table), "the runs together")
     metric_table = _joined(infos, table.metrics)
-    bases = {
-        name: base for info in infos.values() for name, base in (info.get("bases") or {}).items()
-    }
+    bases = {name: base for info in infos.values() for name, base in info.bases.items()}
     by_class = table.failures()
-    means = numbers(table, baseline or first["config"].get("baseline"), bases, metric_table)
+    means = numbers(table, baseline or first.baseline, bases, metric_table)
     return Summary(
-        preset=first["preset"],
+        preset=first.preset,
         metrics=means.metrics,
         paired=means.paired,
         paired_with_base=means.paired_with_base,
@@ -269,32 +277,32 @@ def joined_metrics(runs: Sequence[Path]) -> MetricTable:
     return _joined({run: read_run_json(run) for run in runs}, ())
 
 
-def _joined(infos: Mapping[Path, JsonView], metrics: Sequence[str]) -> MetricTable:
+def _joined(infos: Mapping[Path, RunInfo], metrics: Sequence[str]) -> MetricTable:
     first, *others = infos.items()
-    joined_table = MetricTable.of_run(first[1])
+    joined_table = MetricTable.of_run(first[1].metrics)
     for run, info in others:
         joined_table = joined_table.joined(
-            MetricTable.of_run(info), metrics, f"{first[0]} and {run}"
+            MetricTable.of_run(info.metrics), metrics, f"{first[0]} and {run}"
         )
     return joined_table
 
 
-def _check_alike(infos: Mapping[Path, JsonView]) -> None:
+def _check_alike(infos: Mapping[Path, RunInfo]) -> None:
     """Refuse runs whose rollouts are not of one kind.
 
     Raises:
         InputError: Presets differ, or a scene's content does.
     """
     content_by_scene: dict[str, tuple[str, Path]] = {}
-    first, kind = next((run, info["preset"]) for run, info in infos.items())
+    first, kind = next((run, info.preset) for run, info in infos.items())
     for run, info in infos.items():
-        if info["preset"] != kind:
+        if info.preset != kind:
             raise InputError(
-                f"{first} and {run}: presets {kind!r} and {info['preset']!r}",
+                f"{first} and {run}: presets {kind!r} and {info.preset!r}",
                 "give the command of one run again with --preset",
             )
-        for scene, facts in info["scenes"].items():
-            content = str(facts.get("content_hash") or "")
+        for scene, facts in info.scenes.items():
+            content = facts.content_hash
             other, first_run = content_by_scene.setdefault(scene, (content, run))
             if other != content:
                 raise InputError(

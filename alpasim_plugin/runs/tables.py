@@ -2,9 +2,8 @@
 
 import os
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, real
@@ -12,6 +11,7 @@ from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import AGAIN, read_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import FILES, GATE_FILES, REPORTS, TABLES
 
 
@@ -55,6 +55,6 @@ def ensure_tables(root: Path, say: Callable[[str], None]) -> None:
     REMADE[real(root)] = folder
 
 
-def again(info: Mapping[str, Any]) -> str:
+def again(info: RunInfo) -> str:
     """Return the hint to give the command of a run again."""
-    return f"Give its command again: {shlex.join(info['command'])}"
+    return f"Give its command again: {shlex.join(info.command)}"

@@ -20,6 +20,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.runs.plan import Cell, RunPlan
 from alpasim_plugin.runs.run import Progress
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
@@ -264,11 +265,11 @@ class BoundarySearch:
         return self.plan_of(self.cells)
 
     def announce(self, root: Path, progress: Progress) -> None:
-        """Do nothing: `facts` puts the record into the summary."""
+        """Do nothing: `stated_in` puts the record into the summary."""
 
-    def facts(self) -> JsonObject:
-        """Return the record."""
-        return {"boundary": self.record()}
+    def stated_in(self, info: RunInfo) -> RunInfo:
+        """Return ``run.json`` with the record."""
+        return replace(info, boundary=self.record())
 
     def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
         """Take in the outcomes of a round."""

@@ -1,5 +1,6 @@
-"""Write the tables of options, metrics, scenario keys and fields of file formats into docs/cli.md,
-docs/metrics.md, docs/scenario-files.md and docs/formats.md, from the code.
+"""Write the tables of options, metrics, scenario keys, fields of file formats and members of a run
+folder's files into docs/cli.md, docs/metrics.md, docs/scenario-files.md, docs/formats.md and
+docs/runs.md, from the code.
 
     python docs/scripts/reference_tables.py [--check]
 
@@ -8,9 +9,12 @@ With ``--check`` nothing is written, and the exit code is 1 where a page is stal
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import inspect
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pages import DOCS, replaced, table, write
 from pydantic.fields import FieldInfo
@@ -18,6 +22,7 @@ from pydantic_core import PydanticUndefined
 
 from alpasim_plugin.cli.main import PANELS, load_verb
 from alpasim_plugin.control.can_codec import DBC
+from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.drives.colmap import COLMAP
 from alpasim_plugin.drives.kitti import KITTI
 from alpasim_plugin.drives.py123d import PY123D
@@ -25,8 +30,10 @@ from alpasim_plugin.gaussians.files.packed import COMPRESSED, SPZ
 from alpasim_plugin.gaussians.files.ply import PLY
 from alpasim_plugin.gaussians.files.sog import SOG
 from alpasim_plugin.gaussians.fit.photographs import TRANSFORMS
+from alpasim_plugin.log.run_folder.records import RunInfo
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
+from evaluators.results import Summary
 from scenarios.argoverse import ARGOVERSE
 from scenarios.commonroad_fields import COMMONROAD
 from scenarios.lanelet2 import LANELET2
@@ -166,14 +173,73 @@ def field_table() -> str:
     return table(head, [fields.row() for fields in formats])
 
 
+def documented(record: type[Any]) -> dict[str, str]:
+    """Return the meaning of each member of a record, from its docstring.
+
+    Raises:
+        ValueError: A member has none.
+    """
+    _, _, section = (inspect.getdoc(record) or "").partition("Attributes:\n")
+    entries = re.findall(r"^    (\w[\w, ]*): (.*(?:\n {8}.*)*)", section, re.M)
+    meanings = {
+        name: " ".join(text.split()) for names, text in entries for name in names.split(", ")
+    }
+    undocumented = [field.name for field in fields(record) if field.name not in meanings]
+    if undocumented:
+        raise ValueError(f"{record.__name__}: no docstring of {', '.join(undocumented)}")
+    return {field.name: meanings[field.name] for field in fields(record)}
+
+
+def records_in(record: type[Any]) -> Iterator[type[Any]]:
+    """Yield the records that the members of a record hold, in their order."""
+    hints = list(get_type_hints(record).values())
+    while hints:
+        hint = hints.pop(0)
+        if is_dataclass(hint) and isinstance(hint, type):
+            yield hint
+        hints = [*get_args(hint), *hints]
+
+
+def record_tables(record: type[Any], left_out: Collection[type[Any]]) -> str:
+    """Return a table for a file's record and one for each record inside of it, but for those that
+    have a table elsewhere.
+    """
+    todo = [record]
+    tables: dict[type[Any], str] = {}
+    while todo:
+        current = todo.pop(0)
+        if current in tables or current in left_out:
+            continue
+        meanings = documented(current)
+        rows = [(f"`{name}`", code_words(text)) for name, text in meanings.items()]
+        title = " ".join((inspect.getdoc(current) or "").partition("\n\n")[0].split())
+        heading = "" if current is record else f"`{current.__name__}`: {code_words(title)}\n\n"
+        tables[current] = heading + table(("member", "meaning"), rows)
+        todo += records_in(current)
+    return "\n".join(tables.values())
+
+
+def code_words(text: str) -> str:
+    """Return a docstring's sentence with its code as Markdown has it, and None as JSON has it."""
+    return re.sub(r"\bNone\b", "null", re.sub(r"`+([^`]+)`+", r"`\1`", text))
+
+
+def run_page() -> str:
+    """Return docs/runs.md with the members of the JSON files of a run folder."""
+    text = (DOCS / "runs.md").read_text(encoding="utf-8")
+    text = replaced(text, "run.json", record_tables(RunInfo, [MetricInfo]))
+    return replaced(text, "summary.json", record_tables(Summary, [*records_in(RunInfo)]))
+
+
 def written() -> dict[Path, str]:
     """Return the pages as they should be."""
     tables = {"cli": ("options", cli_tables()), "metrics": ("metrics", metric_table()),
               "scenario-files": ("keys", key_tables()), "formats": ("fields", field_table())}  # fmt: skip
-    return {
+    pages = {
         (page := DOCS / f"{name}.md"): replaced(page.read_text(encoding="utf-8"), block, content)
         for name, (block, content) in tables.items()
     }
+    return pages | {DOCS / "runs.md": run_page()}
 
 
 if __name__ == "__main__":

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.image_metrics import BLACK_MAX
-from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import Aggregation, Direction
 from alpasim_plugin.core.types import MetricInfo as MetricInfo
 from evaluators.metrics.score_table import BENCHMARKS
@@ -31,7 +30,6 @@ AGREE = (
     "direction",
     "aggregation",
 )  # facts without which values of two runs cannot be set side by side
-_FIELDS = frozenset(field.name for field in fields(MetricInfo)) - {"name"}
 
 
 class MetricTable(Mapping[str, MetricInfo]):
@@ -145,33 +143,12 @@ class MetricTable(Mapping[str, MetricInfo]):
                 )
         return MetricTable({**self._metrics, **metrics})
 
-    def as_dict(self) -> dict[str, JsonObject]:
-        """Return METRIC -> the facts that are not their defaults, for ``run.json``."""
-        plain = asdict(UNKNOWN)
-        always = ("unit", "direction", "aggregation", "help")
-        out = {}
-        for name, facts in self.items():
-            out[name] = {
-                key: value
-                for key, value in asdict(facts).items()
-                if key in always or (value != plain[key] and key != "name")
-            }
-        return out
-
     @classmethod
-    def of_run(cls, info: JsonView) -> MetricTable:
-        """Return the table that a run's ``run.json`` carries; ours for what it lacks, so that a run
-        can be read without its plug-ins.
+    def of_run(cls, metrics: Mapping[str, MetricInfo]) -> MetricTable:
+        """Return the table of the metrics that a run's ``run.json`` states; ours for what it lacks,
+        so that a run can be read without its plug-ins.
         """
-        stored = {}
-        for name, facts in (info.get("metrics") or {}).items():
-            known: JsonObject = {
-                key: value for key, value in facts.items() if key in _FIELDS
-            }  # this version may not know all
-            if "limits" in known:
-                known["limits"] = tuple(known["limits"])
-            stored[name] = MetricInfo(**known)
-        return cls(METRICS._metrics | stored, is_read=True)
+        return cls({**METRICS, **metrics}, is_read=True)
 
     def joined(self, other: MetricTable, names: Iterable[str], who: str) -> MetricTable:
         """Return the table of two runs that are set side by side: this one's metrics, and what only

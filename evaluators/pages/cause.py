@@ -23,6 +23,7 @@ from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.reader import last_output, read_json
+from alpasim_plugin.log.run_folder.records import PolicyCheck
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
@@ -68,6 +69,8 @@ TELLING = {
     "route_rig": ("offroad", "wrong_lane", "left_route"),
     "standstill": ("stalled",),
 }
+# Of a policy of simrun, or of one behind an address.
+UNCHECKED = PolicyCheck(None)
 
 
 @dataclass(frozen=True)
@@ -157,14 +160,14 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     ]
     outcomes = outcomes_of(rollout)
     outcome = in_words(outcomes) if outcomes else ending_of(rollout)
-    checks = (run.info.get("policy_checks") or {}).get(rollout.policy) or {}
-    sentences = [f"{CHECK}{text}." for _, text in checks.get("breaches") or ()]
+    check = run.info.policy_checks.get(rollout.policy, UNCHECKED)
+    sentences = [f"{CHECK}{text}." for _, text in check.breaches]
     if not rollout.ok:
         outcome = f"{rollout.failure_class}: {rollout.failure}"
         said = last_output(run.folder / rollout.path / OUTPUT_NAME)
         sentences = [*(sentences or [rollout.failure]), *said]
     sentences += behind_others(run, rollout)
-    for name, text in sorted(checks.get("notes") or (), key=lambda note: note[0] != "lag"):
+    for name, text in sorted(check.notes, key=lambda note: note[0] != "lag"):
         if outcomes & {*TELLING.get(name, ())}:
             sentences.append(f"{CHECK}{text}.")
     if log is not None and rollout.ok:

@@ -185,22 +185,23 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
             property of the case alone.
         accepts_failures: A rollout that did not run to its end is skipped and no error.
     """
-    asked = run.info.get("asked") or []  # what the command named, if that was one thing
+    named = run.info.asked or ()
     facts = {
         "preset": run.summary.preset,
-        "version": run.info.get("version"),
-        "key": run.info.get("key"),
-        "command": " ".join(str(word) for word in run.info.get("command") or []),
+        "version": run.info.version,
+        "key": run.info.key,
+        "command": " ".join(run.info.command),
     }
     with_values = len(run.rollouts) <= MAX_WITH_VALUES
     return Suite(
-        str(asked[0]) if len(asked) == 1 else real(run.folder).name,
+        # what the command named, if that was one thing
+        named[0] if len(named) == 1 else real(run.folder).name,
         [
             _rollout_case(rollout, with_values, outcomes_fail, accepts_failures)
             for rollout in run.rollouts
         ],
         {key: value for key, value in facts.items() if value},
-        str(run.info.get("started_at") or ""),
+        run.info.started_at or "",
     )
 
 

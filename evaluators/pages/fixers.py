@@ -1,6 +1,7 @@
 """What a reader must know of the fixers of a run, and how fast the run was."""
 
-from evaluators.results import Pool, Summary
+from alpasim_plugin.log.run_folder.records import Pool
+from evaluators.results import Summary
 from evaluators.statistics.numbers import duration, listed_counts, plural, short
 
 GUARD = "fixer-"

@@ -105,7 +105,7 @@ def flip_bases(run: Run) -> list[Base]:
     """Return what outcomes are compared with: the baseline's renderer, and its policy where there
     are several.
     """
-    named = (run.info.get("config") or {}).get("baseline")
+    named = run.info.baseline
     _, by_policy = axis_bases(
         [Variant(r, policy) for r in run.renderers for policy in run.policies], named
     )

@@ -24,6 +24,7 @@ from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.reader import reporting
+from alpasim_plugin.log.run_folder.records import Project, json_of
 from alpasim_plugin.log.run_folder.rows import Series, series_by_cell
 from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
@@ -140,7 +141,7 @@ def context(run: Run) -> dict[str, Any]:
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
-        "when": str(run.info.get("started_at") or "")[:16].replace("T", " "),
+        "when": (run.info.started_at or "")[:16].replace("T", " "),
         "overview": overview_of(run),
         "ending_tones": TONES,
         "shots": worst_change(run),
@@ -180,13 +181,21 @@ def context(run: Run) -> dict[str, Any]:
             for cell in run.summary.failures.cells
         },
         "command": command_of(run),
+        "commit": _commit(run.info.project),
+        "options": json_of(run.info.config),
     }
+
+
+def _commit(project: Project | None) -> str:
+    """Return the commit of the user's project, and whether files differ from it."""
+    if project is None:
+        return ""
+    return (project.commit or "") + (", files changed" if project.dirty else "")
 
 
 def command_of(run: Run) -> str:
     """Return the command that made a run."""
-    command = run.info.get("command") or ""
-    return command if isinstance(command, str) else shlex.join(map(str, command))
+    return shlex.join(run.info.command)
 
 
 def by_interest(run: Run) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.types import MetricInfo
+from alpasim_plugin.log.run_folder.records import LogDifference
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
 from evaluators.pages.decision import verdict_text
 from evaluators.pages.fixers import fixer_cautions
@@ -263,9 +264,8 @@ def overview_of(run: Run) -> Overview:
     differences = {} if is_sequential else differences_of(run)
     rows = tuple(_row(run, name, entry, differences) for name, entry in summary.outcomes.items())
     primary = run.table.shown(run.table.primary)
-    asked = run.info.get("asked") or ()
-    size = (plural(len(run.scenes), "scene"), plural(len(run.info.get("seeds") or ()), "seed"))
-    named = some_of(asked, 2)
+    size = (plural(len(run.scenes), "scene"), plural(len(run.info.seeds), "seed"))
+    named = some_of(run.info.asked or (), 2)
     parts = [*([named] if named else []), summary.preset, " \u00d7 ".join(size)]
     if len(run.policies) == 1:
         parts.append(f"policy {run.policies[0]}")
@@ -277,13 +277,13 @@ def overview_of(run: Run) -> Overview:
             f"{summary.copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
             "a policy without a camera drives once for all renderers."
         )
-    repeat = run.info.get("repeat") or {}
-    if repeat.get("repeatable") is False:
-        first = repeat.get("first_difference") or {"component": "log", "step": None}
-        step = "" if first["step"] is None else f" at step {first['step']}"
+    repeat = run.info.repeat
+    if repeat is not None and repeat.repeatable is False:
+        first = repeat.first_difference or LogDifference("log")
+        step = "" if first.step is None else f" at step {first.step}"
         cautions.append(
             "The policy is not repeatable: a rollout that was driven twice differs first in "
-            f"{first['component']}{step}. Paired differences hold that noise too."
+            f"{first.component}{step}. Paired differences hold that noise too."
         )
     return Overview(
         " \u00b7 ".join(parts),

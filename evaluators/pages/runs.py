@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rich import box
 from rich.table import Table
@@ -18,8 +18,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.core.files.lock import is_locked
-from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.records import RunInfo, ScoreConfig, json_of
 from alpasim_plugin.log.run_folder.schema import LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
 from evaluators.metrics import MetricTable
 from evaluators.results import Mean, Summary, read_summary
@@ -30,6 +31,8 @@ CHECK = "simrun check run RUN says what is damaged"
 State = Literal["finished", "running", "unfinished", "damaged"]
 STYLES = {"finished": "", "running": "cyan", "unfinished": "yellow", "damaged": "red"}
 PROBLEM_LETTERS = 90
+# Stands for a run.json that cannot be read.
+NO_INFO = RunInfo("", (), ScoreConfig({}, None), "", (), (), (), {})
 MARKS = frozenset((RUN_INFO, LOCK))  # the first file of a run folder is its lock
 SKIPPED = frozenset(("node_modules", "__pycache__", "site-packages"))
 
@@ -43,14 +46,14 @@ class RunEntry:
         state: ``finished``; ``running`` where a process writes it; ``unfinished`` where none does
             any more; ``damaged`` where it cannot be read.
         problem: Why it is damaged, else empty.
-        info: ``run.json``; empty where it cannot be read.
+        info: ``run.json``; None where it cannot be read.
         summary: ``summary.json``; None where the run is not finished.
     """
 
     folder: Path
     state: State
     problem: str
-    info: JsonView
+    info: RunInfo | None
     summary: Summary | None
 
     @property
@@ -59,7 +62,8 @@ class RunEntry:
         not known.
         """
         try:
-            time = datetime.fromisoformat(str(self.info.get("started_at")))
+            started_at = None if self.info is None else self.info.started_at
+            time = datetime.fromisoformat(str(started_at))
             return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
         except ValueError:
             return datetime.min.replace(tzinfo=UTC)
@@ -69,47 +73,54 @@ class RunEntry:
         """Give how many rollouts were planned and failed; None for scored logs that are not
         finished, and without ``run.json``.
         """
-        outcome = self.info.get("outcome") if self.state == "finished" else None
-        if outcome:
-            return int(outcome["n_rollouts"]), int(outcome["n_failed"])
-        if not self.info or self.info.get("kind") == "score":
+        info = self.info
+        if info is None:
             return None, 0
-        axes = ("renderers", "policies", "scenes", "seeds")
-        return math.prod(len(self.info.get(axis) or ()) for axis in axes), 0
+        if self.state == "finished" and info.outcome is not None:
+            return info.outcome.n_rollouts, info.outcome.n_failed
+        if info.is_of_logs:
+            return None, 0
+        axes = (info.renderers, info.policies, info.scenes, info.seeds)
+        return math.prod(len(axis) for axis in axes), 0
 
     @property
     def variants(self) -> list[tuple[str, str]]:
         """List renderer and policy of each line of the run."""
+        if self.info is None:
+            return []
         return [
-            (str(renderer), str(policy))
-            for policy in self.info.get("policies") or ()
-            for renderer in self.info.get("renderers") or ()
+            (renderer, policy) for policy in self.info.policies for renderer in self.info.renderers
         ]
 
     def metric(self, metric: str, renderer: str, policy: str) -> Mean | None:
         """Return the mean of a metric in ``summary.json``; None where it has none."""
-        if self.summary is None:
+        if self.summary is None or self.info is None:
             return None
-        is_alone = len(self.info["policies"]) == 1
+        is_alone = len(self.info.policies) == 1
         variant = renderer if is_alone else cell_name(renderer, policy)
         return self.summary.metrics.get(variant, {}).get(metric)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         """Return everything for JSON."""
-        info = self.info
-        scenes = info.get("scenes") or {}
-        lists = ("renderers", "policies", "seeds", "asked")
         planned, failed = self.rollouts
+        info = NO_INFO if self.info is None else self.info
+        is_known = self.info is not None
         return {
             "folder": str(self.folder),
             "state": self.state,
             "problem": self.problem,
-            "kind": info.get("kind") or "run",
-            "project": info.get("project") or None,
-            **{name: info.get(name) for name in ("key", "started_at", "version", "preset")},
-            **{name: list(info.get(name) or ()) for name in lists},
-            "scenes": {name: facts.get("content_hash") or "" for name, facts in scenes.items()},
-            "weights": dict(info.get("weights") or {}),
+            "kind": info.kind or "run",
+            "project": None if info.project is None else json_of(info.project),
+            "key": info.key if is_known else None,
+            "started_at": info.started_at,
+            "version": info.version,
+            "preset": info.preset if is_known else None,
+            "renderers": list(info.renderers),
+            "policies": list(info.policies),
+            "seeds": list(info.seeds),
+            "asked": list(info.asked or ()),
+            "scenes": {name: facts.content_hash for name, facts in info.scenes.items()},
+            "weights": info.weights,
             "rollouts": planned,
             "failed": failed if self.state == "finished" else None,
         }
@@ -117,7 +128,7 @@ class RunEntry:
 
 def read_entry(folder: Path) -> RunEntry:
     """Describe a run folder; what is wrong with it is part of the description."""
-    info: JsonView = {}
+    info: RunInfo | None = None
     is_running = is_locked(folder / LOCK)
     try:
         info = read_run_json(folder)
@@ -186,25 +197,34 @@ def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) 
             texts = ["\n".join(column) for column in names]
             for metric in metrics:
                 texts.append("\n".join(value_text(entry, metric, *one) for one in variants))
-        began = str(entry.info.get("started_at") or DASH)[:16].replace("T", " ")
-        project = entry.info.get("project") or {}
-        commit = str(project.get("commit") or DASH)[:7]
-        scenes = entry.info.get("scenes") or {}
-        asked = [str(name) for name in entry.info.get("asked") or scenes]
-        first = (
-            Path(asked[0]).name if asked and Path(asked[0]).is_absolute() else "".join(asked[:1])
-        )
-        more = f" + {len(asked) - 1}" if len(asked) > 1 else ""
+        info = NO_INFO if entry.info is None else entry.info
+        began = (info.started_at or DASH)[:16].replace("T", " ")
         table.add_row(
             Text(escape(os.path.relpath(entry.folder, root.parent)), style="bold"),
             Text(escape(began)),
-            Text(escape(f"{commit}+" if project.get("dirty") else commit)),
-            Text(f"{len(scenes)} x {len(entry.info.get('seeds') or ())} {escape(first)}{more}"),
-            Text(escape(str(entry.info.get("preset") or DASH))),
+            Text(escape(_commit(info))),
+            Text(f"{len(info.scenes)} x {len(info.seeds)} {escape(_first_scenario(info))}"),
+            Text(escape(info.preset or DASH)),
             _state(entry),
             *(Text(text or DASH) for text in texts),
         )
     return table
+
+
+def _commit(info: RunInfo) -> str:
+    """Return the commit of the user's project, with a plus where files differ from it."""
+    if info.project is None or info.project.commit is None:
+        return DASH
+    return info.project.commit[:7] + ("+" if info.project.dirty else "")
+
+
+def _first_scenario(info: RunInfo) -> str:
+    """Return the first scenario that a command named, and how many more it named."""
+    names = info.asked or tuple(info.scenes)
+    if not names:
+        return ""
+    first = Path(names[0]).name if Path(names[0]).is_absolute() else names[0]
+    return first if len(names) == 1 else f"{first} + {len(names) - 1}"
 
 
 def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
@@ -214,7 +234,8 @@ def value_text(entry: RunEntry, metric: str, renderer: str, policy: str) -> str:
     mean = entry.metric(metric, renderer, policy)
     if mean is None or mean.mean is None:
         return DASH
-    facts = MetricTable.of_run(entry.info).shown(metric)
+    stated = {} if entry.info is None else entry.info.metrics
+    facts = MetricTable.of_run(stated).shown(metric)
     unit = "%" if facts.in_percent else mean.unit
     texts = printed(facts, mean.mean, *(mean.ci95_clustered or ()))
     spread = f"({' to '.join(texts[1:])})" if len(texts) > 1 else ""

@@ -69,7 +69,7 @@ def worst_change(run: Run) -> list[Shot]:
         for one in run.by_scene[worst.scene]
         if one.seed == worst.seed and (one.policy == worst.policy or one.renderer == worst.renderer)
     ]
-    bases = run.info.get("bases") or {}
+    bases = run.info.bases
     for one in sorted(beside, key=lambda one: bases.get(one.renderer) != worst.renderer):
         if len(chosen) < SHOWN:
             chosen.add(one.cell)

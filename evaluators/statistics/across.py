@@ -68,8 +68,7 @@ def compare_within(
         pairs = [Pair(own.name, own, other, other.name) for own, other in base.pairs(variants)]
         blocks = dict.fromkeys(BLOCKS, NO_PAIRS) | {BLOCKS[0]: pairs}
     else:
-        own_baseline = (run.info.get("config") or {}).get("baseline")
-        blocks = {**pairs_within(table, baseline or own_baseline, run.info.get("bases") or {})}
+        blocks = {**pairs_within(table, baseline or run.info.baseline, run.info.bases)}
         if baseline is not None:
             named = [pair for pair in blocks[BLOCKS[0]] if pair.baseline == baseline]
             blocks = dict.fromkeys(BLOCKS, NO_PAIRS) | {BLOCKS[0]: named}
@@ -114,7 +113,8 @@ def compare_runs(
     base = table_of_run(first)
     base_variants = variants_in(base)
     named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
-    before, after = (dict(run.info.get("weights") or {}) for run in (first, second))
+    before = first.info.weights
+    after = second.info.weights
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
     # what differs in their weights are other variants, whatever their names
     notes = (f"other weights: {', '.join(changed)}",) if changed else ()

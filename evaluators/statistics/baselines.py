@@ -3,24 +3,28 @@ differs.
 """
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing, read_json_object
+from alpasim_plugin.core.files import parse_json, read_bytes, read_record
 from alpasim_plugin.core.files.atomic import write_json
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.files.limits import JSON_BYTES
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
 from alpasim_plugin.log.run_folder.reader import table_path
+from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS
-from alpasim_plugin.log.run_folder.sides import RolloutTable, Row
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.metrics import MetricTable
 from evaluators.statistics.opening import Run, read_run
 
 SCHEMA_VERSION = 2
+WRITE = "write one with simrun gate RUN --write-baseline FILE"
 MADE_WITH = (
     "key",
     "command",
@@ -49,15 +53,26 @@ def table_of_run(run: Run) -> RolloutTable:
 
 @dataclass(frozen=True)
 class Baseline:
-    """What a baseline file holds."""
+    """What a baseline file holds.
+
+    Attributes:
+        preset: Evaluator preset.
+        scenes: SCENE -> content hash.
+        weights: File of weights -> digest.
+        rows: Of ``rollouts.parquet``.
+        made_with: Members of ``run.json`` for people, which are not compared.
+        metrics: METRIC -> what it is.
+        repeatable: What ``run --repeat`` found; None: not tried.
+        schema_version: Of these members.
+    """
 
     preset: str
-    scenes: Mapping[str, str]  # scene id -> content hash
-    weights: JsonView  # as in run.json
-    rows: Sequence[Row]
-    made_with: JsonView  # command, versions, hardware, start: for people, not compared
-    metrics: JsonView  # what each is, as in run.json
-    repeatable: bool | None  # what ``run --repeat`` found; None: not tried
+    scenes: dict[str, str]
+    weights: dict[str, str]
+    rows: list[JsonObject]
+    made_with: JsonObject
+    metrics: dict[str, MetricInfo]
+    repeatable: bool | None
     schema_version: int = SCHEMA_VERSION
 
     @property
@@ -68,7 +83,8 @@ class Baseline:
 
 def baseline_of(run: Run) -> Baseline:
     """Return a run's results as a baseline."""
-    made_with = {key: run.info[key] for key in MADE_WITH if key in run.info}
+    stated = json_of(run.info)
+    made_with = {key: stated[key] for key in MADE_WITH if key in stated}
     rows = []
     for rollout in run.rollouts:
         row: JsonObject = {
@@ -86,17 +102,17 @@ def baseline_of(run: Run) -> Baseline:
     return Baseline(
         _preset(run),
         scene_hashes(run),
-        dict(run.info.get("weights") or {}),
+        run.info.weights,
         rows,
         made_with,
-        dict(run.info.get("metrics") or {}),
+        run.info.metrics,
         is_repeatable(run),
     )
 
 
 def is_repeatable(run: Run) -> bool | None:
     """Return what ``run --repeat`` found of the run's policies; None where it was not tried."""
-    return (run.info.get("repeat") or {}).get("repeatable")
+    return None if run.info.repeat is None else run.info.repeat.repeatable
 
 
 def write_baseline(run: Run, path: Path) -> None:
@@ -112,7 +128,7 @@ def write_baseline(run: Run, path: Path) -> None:
             f"{run.folder}: {n_failed} of {len(run.rollouts)} rollouts failed",
             "store a run with rollouts that all ran to their end",
         )
-    write_json(path, sealed(asdict(baseline_of(run))))
+    write_json(path, sealed(json_of(baseline_of(run))))
 
 
 def read_baseline(path: Path) -> Baseline:
@@ -124,16 +140,15 @@ def read_baseline(path: Path) -> Baseline:
     """
     if os.path.isdir(path):
         return baseline_of(read_run(path))
-    content = read_json_object(path, do_this="write one with simrun gate RUN --write-baseline FILE")
-    if content.get("schema_version") != SCHEMA_VERSION:
+    data = read_bytes(path, JSON_BYTES, WRITE)
+    content = parse_json(data, path, WRITE)
+    if not isinstance(content, dict) or content.get("schema_version") != SCHEMA_VERSION:
         raise InputError(
             f"{path}: not a baseline of version {SCHEMA_VERSION}",
             "Write one with simrun gate RUN --write-baseline FILE, or name the earlier run's folder.",
         )
     check_seal({DIGEST: None} | content, path, APPROVE)
-    del content[DIGEST]
-    with parsing(path, "restore the file or write it again", "not a baseline"):
-        return Baseline(**content)
+    return read_record(Baseline, data, path, "restore the file or write it again")
 
 
 def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
@@ -149,7 +164,7 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
         raise InputError(
             f"{path}: preset {baseline.preset!r}, the run has {_preset(run)!r}", APPROVE
         )
-    weights = run.info.get("weights") or {}
+    weights = run.info.weights
     changed = [
         name
         for name in sorted({*baseline.weights, *weights})
@@ -158,7 +173,7 @@ def check_matches(baseline: Baseline, run: Run, path: Path) -> None:
     if changed:
         raise InputError(f"{path}: other weights: {', '.join(changed)}", APPROVE)
     check_scenes(baseline.scenes, scene_hashes(run), str(path), APPROVE)
-    stored = MetricTable.of_run({"metrics": baseline.metrics})
+    stored = MetricTable.of_run(baseline.metrics)
     run.table.joined(stored, baseline.metrics, str(path))
 
 
@@ -184,8 +199,7 @@ def scene_hashes(run: Run) -> dict[str, str]:
     Raises:
         InputError: run.json has no hash of a scene.
     """
-    scenes = run.info.get("scenes") or {}
-    hashes = {name: str(facts.get("content_hash") or "") for name, facts in scenes.items()}
+    hashes = {name: facts.content_hash for name, facts in run.info.scenes.items()}
     names = {rollout.scene for rollout in run.rollouts} | hashes.keys()
     bare = sorted(name for name in names if not hashes.get(name))
     if bare:

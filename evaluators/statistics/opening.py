@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder import reader
 from alpasim_plugin.log.run_folder.reader import table_path
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import SUMMARY
 from evaluators.metrics import MetricTable
 from evaluators.results import Failures, Summary, read_summary
@@ -49,7 +49,7 @@ class Run(reader.Run):
     @cached_property
     def table(self) -> MetricTable:
         """Give what the run's metrics are, as the run itself says."""
-        return MetricTable.of_run(self.info)
+        return MetricTable.of_run(self.info.metrics)
 
     @property
     def variants(self) -> list[str]:
@@ -69,9 +69,9 @@ class Run(reader.Run):
         return reasons
 
 
-def command_again(info: JsonView) -> str:
+def command_again(info: RunInfo) -> str:
     """Return the hint to give the command of a run again; finished rollouts are kept."""
-    return f"Give its command again: {shlex.join(info['command'])}"
+    return f"Give its command again: {shlex.join(info.command)}"
 
 
 def read_run(run_dir: Path | str | Run) -> Run:

@@ -12,6 +12,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.records import RunCounts
 from alpasim_plugin.log.run_folder.schema import slug
 from evaluators.alpasim import load_settings
 from policies.simple import ConstantVelocity
@@ -65,12 +66,11 @@ def exported(run):
 
 def test_run_json_says_what_was_asked_and_of_which_commit_and_code(run):
     info = read_run_json(run)
-    assert info["asked"] == ["smoke/straight"]
-    assert info["outcome"] == {"n_rollouts": 4, "n_failed": 0}
-    assert (info["project"]["commit"] is None) == bool(
-        info["project"]["reason"]
-    )  # the tests may run outside a repository
-    assert all(len(info["code"][name]) == 12 for name in ("loop", "scoring"))
+    assert info.asked == ("smoke/straight",)
+    assert info.outcome == RunCounts(n_rollouts=4, n_failed=0)
+    # The tests may run outside a repository.
+    assert (info.project.commit is None) == bool(info.project.reason)
+    assert all(len(info.code[name]) == 12 for name in ("loop", "scoring"))
 
 
 def logs(exported, policy):

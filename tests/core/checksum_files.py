@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, STEPS_NAME, TABLES
+from tests.run_records import run_info
 
 KEYS = ["renderer", "policy", "scene", "seed", "status", "path"]
 
@@ -17,7 +18,7 @@ def vouch_for(root):
     """
     rows = pq.read_table(root / "rollouts.parquet", columns=KEYS).to_pylist()
     info = {"key": "by hand"} | json.loads((root / "run.json").read_text())
-    write_run_json(root, info | {"rollouts": [row["path"] for row in rows]})
+    write_run_json(root, run_info(info | {"rollouts": [row["path"] for row in rows]}))
     for row in rows:
         folder = root / row["path"]
         held = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).exists() else {}

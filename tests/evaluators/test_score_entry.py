@@ -8,10 +8,12 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.types import Box, LoggedPlan, Trajectory
+from alpasim_plugin.log.run_folder.records import json_of
 from evaluators import METRICS, MetricInfo, resolve_evaluators, rollout_values, score
 from evaluators.metrics import MetricTable
 from evaluators.metrics.score import run_evaluator, series
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
+from tests.run_records import MINIMAL, run_info
 
 
 def bad(**changes):
@@ -163,12 +165,13 @@ def test_a_table_refuses_another_metric_under_a_name_that_it_holds():
 
 def test_a_table_comes_back_from_a_run_folder_as_it_was():
     table = METRICS.adding({"jerk": JERK})
-    stored = json.loads(json.dumps(table.as_dict(), allow_nan=False))
-    assert dict(MetricTable.of_run({"metrics": stored})) == dict(table)
+    info = run_info({**MINIMAL, "metrics": {}})
+    stored = json.loads(json.dumps(json_of(replace(info, metrics=dict(table))), allow_nan=False))
+    assert set(stored["metrics"]["offroad"]) >= {"unit", "direction", "aggregation", "help"}
+    assert "name" not in stored["metrics"]["offroad"]
+    stored["metrics"]["jerk"]["of a later version"] = 1
+    assert dict(MetricTable.of_run(run_info(stored).metrics)) == dict(table)
     assert dict(MetricTable.of_run({})) == dict(METRICS)
-    assert dict(
-        MetricTable.of_run({"metrics": {"jerk": {**stored["jerk"], "of a later version": 1}}})
-    ) == dict(table)
 
 
 def test_two_runs_agree_on_unit_side_and_reduction_and_may_differ_in_words():

@@ -17,6 +17,7 @@ from alpasim_plugin.log.run_folder.writer import write_steps
 from alpasim_plugin.runs.summary import write_summary
 from evaluators.pages.flips import find_flips
 from evaluators.statistics.opening import read_run
+from tests.run_records import run_info
 
 METRICS = (
     "collision_any",
@@ -350,7 +351,7 @@ def _picture(renderer, k, width, height):
 
 
 def _run_json(plan, maps, manifests):
-    return {
+    content = {
         "key": "made",
         "bases": {"onefixer": "3dgs"} if "onefixer" in plan.renderers else {},
         "pool": {
@@ -390,3 +391,4 @@ def _run_json(plan, maps, manifests):
             "actors: 14 never seen by a camera",
         ],
     }
+    return run_info(content)

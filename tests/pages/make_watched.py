@@ -17,6 +17,7 @@ from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
 from evaluators.statistics.opening import read_run
 from tests.pages.make_run import DT_US, Plan, make_run
+from tests.run_records import run_info
 
 CAMERA = CameraSpec("front", 64, 36, np.array([[40.0, 0, 32], [0, 40, 18], [0, 0, 1]]), np.eye(4))
 BARS = 8  # a frame's index is written as eight bars, black or white, the highest bit on the left
@@ -189,7 +190,7 @@ def unfinished(folder, without):
     """
     write_manifests(folder)
     info = json.loads((folder / "run.json").read_text())
-    write_run_json(folder, {"key": "k", "content": "c"} | info)
+    write_run_json(folder, run_info({"key": "k", "content": "c"} | info))
     for name in ("summary.json", "rollouts.parquet", "steps.parquet", "flips.json"):
         (folder / name).unlink(missing_ok=True)
     later = {}

@@ -52,7 +52,7 @@ def test_every_row_and_number_of_the_table_is_in_the_block(run):
 
 
 def test_clips_are_linked_where_the_run_made_them(run):
-    info = {**run.info, "config": {**run.info["config"], "video": "all"}}
+    info = dataclasses.replace(run.info, config=dataclasses.replace(run.info.config, video="all"))
     found = unpacked(rollout_block(dataclasses.replace(run, info=info)).data)
     for state, rollout in zip(found["state"], run.rollouts, strict=True):
         assert bool(state & HAS_CLIP) is (run.folder / rollout.path / "front.mp4").is_file()

@@ -210,7 +210,7 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
         every.append(dataclasses.replace(one, metrics={**one.metrics, **flags}))
     rollouts = [one for one in every if (one.scene, one.seed) == (scene, first.seed)]
     run = dataclasses.replace(
-        run, rollouts=tuple(every), info=run.info | {"bases": {"onefixer": "3dgs"}}
+        run, rollouts=tuple(every), info=dataclasses.replace(run.info, bases={"onefixer": "3dgs"})
     )
     for one in rollouts:
         (run.folder / one.path / "rollout.asl").touch()

@@ -12,7 +12,12 @@ from jinja2 import Environment, nodes
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.log.run_folder.checksums import state_files
-from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json, write_manifest
+from alpasim_plugin.log.run_folder.manifests import (
+    read_manifest,
+    read_run_json,
+    write_manifest,
+    write_run_json,
+)
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, TABLES
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.summary import write_summary
@@ -173,6 +178,36 @@ def test_a_member_of_another_type_is_refused_by_its_name(
     file.write_text(json.dumps(content))
     with pytest.raises(InputError, match=member):
         read_summary(file, "write it again")
+
+
+@pytest.mark.parametrize(
+    ("member", "value", "problem"),
+    [
+        ("seeds", ["0"], "seeds.0"),
+        ("key", None, "key"),
+        ("scenes", {"one": {"ref": {"seed": 1}}}, "scenes.one.ref.path"),
+        ("pool", {"workers": "two"}, "pool.workers"),
+    ],
+)
+def test_a_run_json_with_a_member_of_another_type_is_refused_by_its_name(
+    tmp_path, two_changes, capsys, member, value, problem
+):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(two_changes, damaged)
+    path = damaged / RUN_INFO
+    content = json.loads(path.read_text()) | {member: value}
+    path.write_text(json.dumps(content))
+    state_files(damaged, [RUN_INFO, *TABLES])
+    assert run_command(["compare", str(damaged)]) == 2
+    assert f"run.json: {problem}: " in capsys.readouterr().err
+
+
+def test_what_run_json_says_survives_the_file(tmp_path, two_changes):
+    info = read_run_json(two_changes)
+    write_run_json(tmp_path, info)
+    assert read_run_json(tmp_path) == info
+    assert info.metrics == {}
+    assert info.pool is not None
 
 
 def test_what_a_summary_says_survives_the_file(two_changes):

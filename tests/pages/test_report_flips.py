@@ -9,6 +9,7 @@ from evaluators.metrics.outcomes import in_words, outcomes_of
 from evaluators.pages.flips import find_flips, flip_rows
 from evaluators.pages.html import write_report
 from evaluators.statistics.opening import Run, read_run
+from tests.run_records import MINIMAL, run_info
 
 
 def rollout(renderer, seed=0, status="ok", **metrics):
@@ -16,7 +17,7 @@ def rollout(renderer, seed=0, status="ok", **metrics):
 
 
 def run_of(*rollouts):
-    return Run(Path(), {"renderers": ["clean", "3dgs"]}, rollouts, ())
+    return Run(Path(), run_info({**MINIMAL, "renderers": ["clean", "3dgs"]}), rollouts, ())
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_policies_behind_one_renderer_flip_as_renderers_do():
         for policy, value in (("a", 0.0), ("b", 1.0))
     ]
     (flip,), compared = find_flips(
-        Run(Path(), {"renderers": ["clean"], "policies": ["a", "b"]}, rollouts, ())
+        Run(Path(), run_info({**MINIMAL, "policies": ["a", "b"]}), rollouts, ())
     )
     assert (compared, flip.sides, flip.was, flip.now) == (1, ("a", "b"), "no event", "off-road")
     assert flip.key == ("clean", "b", "s", 0, "clean/a")

@@ -4,18 +4,20 @@ logs or pictures.
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.log.run_folder.manifests import write_run_json
+from alpasim_plugin.log.run_folder.records import RunCounts
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_TABLE
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_table
 from evaluators.results import Failures, Summary, to_json
 from evaluators.statistics.summary import numbers
+from tests.run_records import run_info
 
 COMMITS = ("3f2a9c1d" * 5, "8b07ee42" * 5, "c51d9a60" * 5)
 METRICS = ("offroad", "lateral_distance_m", "progress")
@@ -50,7 +52,7 @@ def make_one(root, one):
     """Write a finished run folder below ``root`` and return it."""
     folder = root / one.name
     rows = rows_of(one)
-    write_run_json(folder, info_of(one) | {"outcome": {"n_rollouts": len(rows), "n_failed": 0}})
+    write_run_json(folder, replace(run_info(info_of(one)), outcome=RunCounts(len(rows), 0)))
     write_table(folder / "rollouts.parquet", rows, ROLLOUTS_TABLE.arrow(METRICS))
     means = numbers(RolloutTable.of_files([folder / "rollouts.parquet"]))
     failures = Failures(n_failed=0, n_rollouts=len(rows), by_class={})
@@ -96,6 +98,10 @@ def rows_of(one):
     return rows
 
 
+def ref(path):
+    return {"path": path, "seed": None, "overrides": [], "source": None}
+
+
 def info_of(one):
     """Return ``run.json`` as a run writes it, as far as lists and trends read it."""
     project = {
@@ -133,7 +139,7 @@ def info_of(one):
         "policies": list(one.policies),
         "seeds": list(one.seeds),
         "scenes": {
-            name: {"content_hash": digest, "ref": {"path": f"/x/{name}.yaml"}}
+            name: {"content_hash": digest, "ref": ref(f"/x/{name}.yaml")}
             for name, digest in one.scenes.items()
         },
         "bases": {"onefixer": "3dgs"},

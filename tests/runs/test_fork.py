@@ -10,7 +10,7 @@ import pytest
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
-from alpasim_plugin.log.run_folder.manifests import write_run_json
+from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.runs.fork import Change, fork_rollout, merge_sensors
 from alpasim_plugin.runs.logged_rollout import find_rollout
@@ -142,8 +142,11 @@ def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root, p
 
 
 def test_a_scenario_that_has_changed_is_refused(root, tmp_path):
-    info = read_json(root / "run.json")
-    info["scenes"]["smoke-lead_car"]["ref"]["overrides"][0] = "timing.duration_us=1100000"
+    info = read_run_json(root)
+    scene = info.scenes["smoke-lead_car"]
+    _, *overrides = scene.ref.overrides
+    ref = replace(scene.ref, overrides=("timing.duration_us=1100000", *overrides))
+    info = replace(info, scenes={"smoke-lead_car": replace(scene, ref=ref)})
     changed = shutil.copytree(root, tmp_path / "run")
     (changed / "files.json").unlink()  # else run.json is damaged
     write_run_json(changed, info)

@@ -23,6 +23,7 @@ from alpasim_plugin.drives.build import read_inputs as drive_inputs
 from alpasim_plugin.drives.splat import read_inputs as splat_inputs
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
 from alpasim_plugin.runs.changes import changed_evaluators
@@ -444,11 +445,11 @@ def test_score_states_evaluators_and_says_which_was_edited(evaluator, tmp_path, 
     read = {evaluator / "value.json", evaluator / "unit.json"}
     assert {Path(path) for path in read_json(manifest)["score_inputs"]} == read
     assert run_command(command) == 2
-    stated = info["parts"] | {"evaluator mine.py:Mine": {"digest": "other", "code": {}}}
+    parts = read_run_json(evaluator / "scored").parts
+    name = "evaluator mine.py:Mine"
+    stated = parts | {name: replace(parts[name], digest="other", code={})}
     evaluators = resolve_evaluators(["mine.py:Mine"])
     changes = changed_evaluators(stated, evaluators)
     assert f"{evaluator / 'scale_of_mine.py'} was not read before" in changes
-    assert changed_evaluators(info["parts"], evaluators) == []
-    assert changed_evaluators(info["parts"], evaluators[:-1]) == [
-        "evaluator mine.py:Mine is left out"
-    ]
+    assert changed_evaluators(parts, evaluators) == []
+    assert changed_evaluators(parts, evaluators[:-1]) == ["evaluator mine.py:Mine is left out"]

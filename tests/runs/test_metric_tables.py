@@ -5,6 +5,7 @@ quantity may not.
 import itertools
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +98,7 @@ def places(tmp_path_factory):
             continue
         shutil.copytree(root / "first", root / name)
         table = table_of(resolve_evaluators([f"{plugin}:Height"]))
-        write_run_json(root / name, read_run_json(root / "first") | {"metrics": table.as_dict()})
+        write_run_json(root / name, replace(read_run_json(root / "first"), metrics=dict(table)))
         state_files(root / name, ["run.json"])
     return root
 

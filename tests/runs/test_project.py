@@ -4,6 +4,7 @@ import subprocess
 
 import pytest
 
+from alpasim_plugin.log.run_folder.records import Project
 from alpasim_plugin.runs.provenance import project
 
 WHO = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
@@ -23,7 +24,7 @@ def nothing_stated(monkeypatch, tmp_path):
 
 def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
     git(tmp_path, "init", "-q", "-b", "trunk")
-    assert project(tmp_path)["reason"]  # no commit yet
+    assert project(tmp_path).reason  # no commit yet
     (tmp_path / "policy.py").write_text("a")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "-qm", "first")
@@ -32,10 +33,10 @@ def test_a_commit_a_changed_file_and_a_detached_head(tmp_path):
     below = tmp_path / "deeper"
     below.mkdir()
     found = project(below)
-    assert found == {"commit": commit, "dirty": False, "reason": ""}
+    assert found == Project(commit=commit, dirty=False, reason="")
     (tmp_path / "policy.py").write_text("b")
     git(tmp_path, "checkout", "-q", "--detach")
-    assert project(tmp_path)["dirty"]
+    assert project(tmp_path).dirty
 
 
 def test_a_program_that_the_repository_names_is_not_run(tmp_path):
@@ -76,7 +77,7 @@ def test_a_program_that_the_repository_names_is_not_run(tmp_path):
         git(own, "config", name, value)
     (own / "a").write_text("b")
     found = project(own)
-    assert (found["commit"], found["dirty"]) == (
+    assert (found.commit, found.dirty) == (
         git(own, "-c", "log.showSignature=false", "rev-parse", "HEAD"),
         True,
     )
@@ -89,18 +90,18 @@ def test_a_program_that_the_repository_names_is_not_run(tmp_path):
     git(own, "config", "core.repositoryFormatVersion", "1")
     for path in (own / ".git" / "objects").glob("??/*"):  # what is missing would be fetched
         path.unlink()
-    assert project(own)["commit"] is None
+    assert project(own).commit is None
     git(own, "config", "filter.y=z.clean", str(spy))
-    assert project(own)["commit"] is None
+    assert project(own).commit is None
     assert not (tmp_path / "was-run").exists(), (tmp_path / "was-run").read_text()
 
 
 def test_without_a_repository_or_without_git_it_is_said_why(tmp_path, monkeypatch):
-    assert "not a git repository" in project(tmp_path)["reason"]
+    assert "not a git repository" in project(tmp_path).reason
     monkeypatch.setenv("SIMRUN_COMMIT", "3F2A9C1")
-    assert project(tmp_path)["commit"] == "3f2a9c1"
+    assert project(tmp_path).commit == "3f2a9c1"
     monkeypatch.setenv("SIMRUN_COMMIT", "$CI_COMMIT")
-    assert project(tmp_path)["reason"] == "SIMRUN_COMMIT is no commit: '$ci_commit'"
+    assert project(tmp_path).reason == "SIMRUN_COMMIT is no commit: '$ci_commit'"
     monkeypatch.delenv("SIMRUN_COMMIT")
     monkeypatch.setenv("PATH", "")
-    assert project(tmp_path)["reason"] == "git is not installed"
+    assert project(tmp_path).reason == "git is not installed"

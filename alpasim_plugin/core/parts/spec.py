@@ -132,20 +132,6 @@ class PartSpec:
             return "files that its code opens by itself and does not declare in `files`; installed libraries"
         return ""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything for ``run.json``."""
-        return {
-            "name": self.name,
-            "target": self.target,
-            "label": self.label,
-            "digest": self.digest,
-            "trained": self.trained,
-            "files": dict(self.files),
-            "code": dict(self.code),
-            "unseen": self.unseen,
-            "settings": None if self.settings is None else self.settings.model_dump(mode="json"),
-        }
-
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the target before the rest: settings may be objects of a module that only
         `make_importable` lets be found.

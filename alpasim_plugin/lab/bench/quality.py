@@ -38,7 +38,8 @@ from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
 from alpasim_plugin.log.run_folder.reader import read_json
-from alpasim_plugin.runs.provenance import hardware, versions
+from alpasim_plugin.log.run_folder.records import json_of
+from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
 VERSION = 4  # of what a row holds and how it is measured; part of its key
@@ -326,7 +327,10 @@ def measure_quality(
         "device": first.device,
         "jobs": jobs,
         "threads": first.threads,
-        "fixers": {label: spec and spec.as_dict() for label, spec in variants.items()},
+        "fixers": {
+            label: None if spec is None else json_of(part_facts(spec))
+            for label, spec in variants.items()
+        },
         "units": {label: unit_of(spec) for label, spec in variants.items()},
         "networks": networks(first.weights),
         "load": os.getloadavg()[0],

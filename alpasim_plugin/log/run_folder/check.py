@@ -1,7 +1,7 @@
 """Compare a run folder with the digests in its manifests; nothing is written here."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -11,6 +11,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import inside
 from alpasim_plugin.log.run_folder.checksums import problem_of, stated_files
 from alpasim_plugin.log.run_folder.manifests import Damage, inspect_rollout, read_run_json
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.schema import (
     FILES,
     ROLLOUTS_FOLDER,
@@ -86,19 +87,19 @@ def _without_digest(names: Iterable[str]) -> list[Damage]:
     return [Damage("", name, f"{FILES} holds no digest of it") for name in names]
 
 
-def cells_of_run(info: Mapping[str, Any]) -> tuple[str, ...]:
+def cells_of_run(info: RunInfo) -> tuple[str, ...]:
     """Return the folders of a run's rollouts, in the order of the tables.
 
     ``run.json`` lists them where they do not follow from its scenes, renderers, policies and seeds:
     scored logs, and a run that stopped when it was decided.
     """
-    if "rollouts" in info:
-        return tuple(info["rollouts"])
-    if info.get("kind") == "score":
+    if info.rollouts is not None:
+        return info.rollouts
+    if info.is_of_logs:
         return ()
     return tuple(
         rollout_folder(renderer, policy, scene, seed).as_posix()
         for scene, renderer, policy, seed in product(
-            info["scenes"], info["renderers"], info["policies"], info["seeds"]
+            info.scenes, info.renderers, info.policies, info.seeds
         )
     )

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Literal, cast
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import read_json_as, real
+from alpasim_plugin.core.files import parse_json, read_bytes, read_json_as, read_record, real
 from alpasim_plugin.core.files.atomic import write_json
+from alpasim_plugin.core.files.limits import JSON_BYTES
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
@@ -21,6 +22,7 @@ from alpasim_plugin.log.run_folder.checksums import (
     problem_of,
     sealed,
 )
+from alpasim_plugin.log.run_folder.records import RunInfo, json_of
 from alpasim_plugin.log.run_folder.schema import (
     DERIVED,
     DRIVEN,
@@ -28,7 +30,7 @@ from alpasim_plugin.log.run_folder.schema import (
     RUN_INFO,
     STEPS_NAME,
 )
-from alpasim_plugin.log.run_folder.shapes import REQUIRED_OF_RUN, ManifestFile, RunInfo
+from alpasim_plugin.log.run_folder.shapes import ManifestFile
 
 AGAIN = "Give the command of the run again: finished rollouts are kept."
 
@@ -140,20 +142,18 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
     return RolloutState(manifest, tuple(damage))
 
 
-def write_run_json(root: Path, info: JsonView) -> None:
+def write_run_json(root: Path, info: RunInfo) -> None:
     """Write ``run.json``."""
-    write_json(root / RUN_INFO, info)
+    write_json(root / RUN_INFO, json_of(info))
 
 
-def read_run_json(root: Path) -> JsonObject:
+def read_run_json(root: Path) -> RunInfo:
     """Read ``run.json``.
 
     Raises:
         InputError: It is missing or damaged, or a member is missing or has another type.
     """
     path = root / RUN_INFO
-    info = cast("JsonObject", read_json_as(RunInfo, path, do_this=AGAIN))
-    missing = [name for name in REQUIRED_OF_RUN if name not in info]
-    if missing:
-        raise InputError(f"{path} lacks the member {missing[0]!r}.", AGAIN)
-    return info
+    data = read_bytes(path, JSON_BYTES, AGAIN)
+    parse_json(data, path, AGAIN)  # refuses what no reader should take
+    return read_record(RunInfo, data, path, AGAIN)

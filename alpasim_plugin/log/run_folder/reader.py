@@ -29,6 +29,7 @@ from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
+from alpasim_plugin.log.run_folder.records import RunInfo
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
 from alpasim_plugin.log.run_folder.schema import (
     AGAIN,
@@ -72,7 +73,7 @@ class Run:
     """
 
     folder: Path
-    info: JsonView
+    info: RunInfo
     rollouts: Sequence[Rollout]
     metric_names: tuple[str, ...]
     planned: int = 0
@@ -117,20 +118,17 @@ class Run:
     @property
     def renderers(self) -> list[str]:
         """List renderers in the order of the command."""
-        return self._in_order("renderers", (r.renderer for r in self.rollouts))
+        return _in_order(self.info.renderers, (r.renderer for r in self.rollouts))
 
     @property
     def policies(self) -> list[str]:
         """List policies in the order of the command."""
-        return self._in_order("policies", (r.policy for r in self.rollouts))
+        return _in_order(self.info.policies, (r.policy for r in self.rollouts))
 
     @property
     def scenes(self) -> list[str]:
         """List scene ids in the order of ``run.json``."""
-        return self._in_order("scenes", (r.scene for r in self.rollouts))
-
-    def _in_order(self, axis: str, seen: Iterable[str]) -> list[str]:
-        return list(dict.fromkeys([*(self.info.get(axis) or ()), *seen]))
+        return _in_order(self.info.scenes, (r.scene for r in self.rollouts))
 
     def rollouts_of(self, variant: str) -> list[Rollout]:
         """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""
@@ -268,6 +266,11 @@ def last_output(path: Path) -> list[str]:
     lines = read_bytes(path, SOURCE_BYTES).decode("utf-8", "replace").rstrip().splitlines()
     lines = [line for line in lines if line.strip(" ~^")]
     return [*(line.rstrip() for line in lines[-TRACEBACK_LINES:]), f"log {path}"]
+
+
+def _in_order(stated: Iterable[str], driven: Iterable[str]) -> list[str]:
+    """Return names, each once: those that ``run.json`` states, then others of the rollouts."""
+    return list(dict.fromkeys([*stated, *driven]))
 
 
 def reporting(run: Run) -> AbstractContextManager[None]:

@@ -1,0 +1,417 @@
+"""What the JSON files of a run folder say, as records: ``run.json`` and ``manifest.json``.
+
+`json_of` writes a record, `alpasim_plugin.core.files.read_record` reads it. Types are strict; members
+that a record does not name are not looked at. A member whose default is None is left out of the file
+where it is None: it does not apply.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator
+
+from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.metric_types import MetricInfo
+
+INFINITE = ("inf", "-inf")  # JSON has no number for them
+
+
+def _number_of(value: object) -> object:
+    """Return the infinite number that a text stands for; all else as it is."""
+    return float(str(value)) if value in INFINITE else value
+
+
+Number = Annotated[float, BeforeValidator(_number_of)]  # may be infinite
+Status = Literal["ok", "failed"]
+
+
+@dataclass(frozen=True)
+class Project:
+    """The repository from which a run was started.
+
+    Attributes:
+        commit: Full hash of the commit; None where there is none.
+        dirty: Whether a file that git follows differs from the commit.
+        reason: Why there is no commit, else empty.
+    """
+
+    commit: str | None
+    dirty: bool | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class SceneRef:
+    """How a scenario was named when it was driven.
+
+    Attributes:
+        path: Its file.
+        seed: Given beside the file's; None: the file's.
+        overrides: KEY=VALUE that were set in it.
+        source: Plug-in that read the file; None: one of simrun's own.
+    """
+
+    path: str
+    seed: int | None
+    overrides: tuple[str, ...]
+    source: str | None
+
+
+@dataclass(frozen=True)
+class SceneFacts:
+    """A scene of a run.
+
+    Attributes:
+        source: Kind of its file.
+        ref: How it was named; scored logs have none.
+        content_hash: Digest of the resolved scenario and of every file that was read for it.
+        files: Path of each of those files -> digest.
+        seed: Of the scenario.
+        varied: Parameter -> value in the file and value that was driven.
+        duration_s: Seconds.
+        rates, latency, degradation, environment, vehicle: The scenario's settings of these names.
+        reconstruction: Key of its 3DGS model.
+        notes: What the scenario leaves out.
+    """
+
+    source: str = ""
+    ref: SceneRef | None = None
+    content_hash: str = ""
+    files: dict[str, str] = field(default_factory=dict)
+    seed: int | None = None
+    varied: dict[str, list[Any]] = field(default_factory=dict)
+    duration_s: float | None = None
+    rates: JsonObject | None = None
+    latency: JsonObject | None = None
+    degradation: JsonObject | None = None
+    environment: JsonObject | None = None
+    vehicle: JsonObject | None = None
+    reconstruction: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PartFacts:
+    """A part of a run: a renderer, fixer, policy, controller, evaluator or source.
+
+    Attributes:
+        name: As the command named it.
+        target: ``module:Class``.
+        label: Name and what it is in a few words.
+        digest: Of its code, settings and files; None for a remote service.
+        trained: Its weights were trained; None where it has none.
+        files: Path of each file that it declares -> digest.
+        code: Path of each file of its code -> digest.
+        unseen: What the digest cannot cover, in words; else empty.
+        settings: As they were resolved; None where it has none.
+    """
+
+    name: str
+    target: str
+    label: str
+    digest: str | None
+    trained: bool | None
+    files: dict[str, str]
+    code: dict[str, str]
+    unseen: str
+    settings: JsonObject | None
+
+
+@dataclass(frozen=True)
+class PolicyCheck:
+    """What the check of a policy found before the run.
+
+    Attributes:
+        digest: Of the policy that was checked.
+        breaches: Name and sentence of each rule that it breaks.
+        notes: Name and sentence of what is allowed and worth knowing.
+    """
+
+    digest: str | None
+    breaches: tuple[tuple[str, str], ...] = ()
+    notes: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class RunCounts:
+    """How many rollouts a run has.
+
+    Attributes:
+        n_rollouts: All of them.
+        n_failed: Those that could not be run or scored.
+    """
+
+    n_rollouts: int
+    n_failed: int
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Throughput of all workers of a run together, start-up included.
+
+    Attributes:
+        workers: Processes.
+        threads_per_worker: Threads of each.
+        wall_s: Seconds from the first rollout to the last.
+        frames: Camera frames that were rendered.
+        frames_per_s_total: Of all workers; None without frames.
+        executor: Where rollouts ran; None: on this machine.
+    """
+
+    workers: int
+    threads_per_worker: int
+    wall_s: float
+    frames: int
+    frames_per_s_total: float | None
+    executor: str | None = None
+
+
+@dataclass(frozen=True)
+class CellNames:
+    """The key of a rollout.
+
+    Attributes:
+        renderer, policy, scene, seed: As in the tables.
+    """
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class LogDifference:
+    """Where two logs first differ.
+
+    Attributes:
+        component: What differs.
+        t_us: When, microseconds.
+        step: Control step; None where it belongs to none.
+        what: The difference in words.
+    """
+
+    component: str
+    t_us: int | None = None
+    step: int | None = None
+    what: str = ""
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """What driving a rollout a second time showed.
+
+    Attributes:
+        repeatable: The two logs are equal; None where nothing could be compared.
+        reason: Why nothing could be compared.
+        cell: The rollout that was driven twice.
+        digests: Of its two logs.
+        first_difference: None where they are equal.
+    """
+
+    repeatable: bool | None
+    reason: str | None = None
+    cell: CellNames | None = None
+    digests: tuple[str, ...] = ()
+    first_difference: LogDifference | None = None
+
+
+@dataclass(frozen=True)
+class Fork:
+    """How a rollout continues another one.
+
+    Attributes:
+        after_us: When the parts were replaced, microseconds after the first frame.
+        renderer, policy, seed: What took the place of the original's; None: nothing did.
+        of: Name of the original rollout.
+        replay: ``equal``: up to then the logs are equal, bit for bit.
+    """
+
+    after_us: int
+    renderer: str | None
+    policy: str | None
+    seed: int | None
+    of: str
+    replay: Literal["equal"]
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The options of a run as they were resolved.
+
+    Attributes:
+        preset: Evaluator preset.
+        images: Camera frames in the logs.
+        video: Which rollouts get a film.
+        device: Where renderers compute.
+        baseline: RENDERER, POLICY or RENDERER/POLICY that the others are compared with.
+        fixer: KEY=VALUE of the fixers' settings.
+        controller: Of the plans; None: the policy's.
+        evaluators: Further evaluators.
+        workers: Processes.
+        threads_per_worker: Threads of each.
+    """
+
+    preset: str
+    images: Literal["none", "jpeg", "png"]
+    video: Literal["none", "failures", "all"]
+    device: str
+    baseline: str | None
+    fixer: tuple[str, ...]
+    controller: str | None
+    evaluators: tuple[str, ...]
+    workers: int
+    threads_per_worker: int
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """By what logs were scored.
+
+    Attributes:
+        preset: Settings of the evaluator preset.
+        settings: AlpaSim's, with its preset.
+    """
+
+    preset: JsonObject
+    settings: JsonObject | None
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """``run.json``: the command, and everything that decides the results.
+
+    Attributes:
+        key: Short digest of the command; a folder belongs to one.
+        command: The command line, by words.
+        config: Its options; of scored logs, the settings of preset and evaluation.
+        preset: Evaluator preset.
+        renderers, policies, seeds: In the order of the command.
+        scenes: SCENE -> facts.
+        schema_version: Version of these members.
+        content: Digest of all that decides the rollouts.
+        kind: ``score``, ``fork``, ``decide`` or ``vary``; None: a plain run.
+        version: Of simrun.
+        started_at: Date and time in UTC, ISO 8601.
+        project: The repository from which the command was given.
+        asked: The scenarios as the command named them.
+        bases: RENDERER with a fixer -> the renderer below it.
+        fixers: RENDERER -> its fixer.
+        parts: ``KIND NAME`` -> facts of each part.
+        code: Digests of simrun's code.
+        metrics: METRIC -> what it is.
+        unseen: ``KIND NAME`` -> what the digest of a part cannot cover.
+        weights: File of weights -> digest.
+        hardware: Processor, cores, memory and operating system.
+        versions: Library -> version.
+        left_out: What the scenes leave out, in words.
+        pool: Throughput of the workers.
+        policy_checks: POLICY -> what its check found.
+        repeat: What ``--repeat`` found.
+        outcome: How many rollouts failed; None until the run is finished.
+        rollouts: Folders of the rollouts, where they do not follow from scenes, renderers, policies
+            and seeds.
+        boundary: What ``--vary`` found (`evaluators.statistics.boundary`).
+        fork: What was replaced, and when; of a fork.
+        logs: Paths of the scored logs.
+        alpasim: AlpaSim's aggregation of scored logs.
+        exit_code: Of ``simrun score``.
+    """
+
+    key: str
+    command: tuple[str, ...]
+    config: RunConfig | ScoreConfig
+    preset: str
+    renderers: tuple[str, ...]
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    scenes: dict[str, SceneFacts]
+    schema_version: int = 1
+    content: str | None = None
+    kind: str | None = None
+    version: str | None = None
+    started_at: str | None = None
+    project: Project | None = None
+    asked: tuple[str, ...] | None = None
+    bases: dict[str, str] = field(default_factory=dict)
+    fixers: dict[str, PartFacts] = field(default_factory=dict)
+    parts: dict[str, PartFacts] = field(default_factory=dict)
+    code: dict[str, str] = field(default_factory=dict)
+    metrics: dict[str, MetricInfo] = field(default_factory=dict)
+    unseen: dict[str, str] = field(default_factory=dict)
+    weights: dict[str, str] = field(default_factory=dict)
+    hardware: JsonObject = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    pool: Pool | None = None
+    policy_checks: dict[str, PolicyCheck] = field(default_factory=dict)
+    repeat: Repeat | None = None
+    outcome: RunCounts | None = None
+    rollouts: tuple[str, ...] | None = None
+    boundary: JsonObject | None = None
+    fork: Fork | None = None
+    logs: tuple[str, ...] | None = None
+    alpasim: JsonObject | None = None
+    exit_code: int | None = None
+
+    @property
+    def is_of_logs(self) -> bool:
+        """Tell whether logs were scored, and nothing was driven."""
+        return self.kind == "score"
+
+    @property
+    def baseline(self) -> str | None:
+        """Give the baseline that the command named; None where it named none."""
+        return self.config.baseline if isinstance(self.config, RunConfig) else None
+
+
+def json_of(record: object) -> JsonObject:
+    """Return a record as JSON's plain data.
+
+    Example:
+        >>> json_of(RunCounts(3, 1))
+        {'n_rollouts': 3, 'n_failed': 1}
+    """
+    content: JsonObject = {}
+    for member in fields(record):  # type: ignore[arg-type]
+        value = getattr(record, member.name)
+        if value is None and member.default is None:
+            continue
+        content[member.name] = _plain(value)
+    return content
+
+
+def _plain(value: Any) -> Any:
+    """Return a value of a record as JSON holds it."""
+    if isinstance(value, MetricInfo):
+        return metric_as_json(value)
+    if is_dataclass(value):
+        return json_of(value)
+    if isinstance(value, Mapping):
+        return {key: _plain(member) for key, member in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(member) for member in value]
+    if isinstance(value, float) and math.isinf(value):
+        return str(value)
+    return value
+
+
+ALWAYS_STATED = ("unit", "direction", "aggregation", "help")  # members of every metric
+PLAIN_METRIC = MetricInfo("", "lower", "mean", "")
+
+
+def metric_as_json(metric: MetricInfo) -> JsonObject:
+    """Return what a metric is, without the members that are as they usually are, and without its
+    name, which is the key.
+    """
+    usual = asdict(PLAIN_METRIC)
+    content: JsonObject = {}
+    for key, value in asdict(metric).items():
+        is_special = key != "name" and value != usual[key]
+        if key in ALWAYS_STATED or is_special:
+            content[key] = value
+    return content
