@@ -15,6 +15,7 @@ from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
 from scenarios.recorded import RecordedLog
 from scenarios.schema_parts import SHIPPED
+from scenarios.unread_forms import unread_form
 from scenarios.variation import SceneDraft
 
 SCENARIO_FILE = "scenario.yaml"  # of an imported drive
@@ -175,7 +176,8 @@ def import_advice(path: Path) -> str | None:
     places = [path / name for name in DRIVES]
     if path.name == DRIVES[0] or any(os.path.exists(one) for one in places):
         return f"make one: simrun import drive {path} {out}"
-    return None
+    unread = unread_form(path)
+    return None if unread is None else f"{unread[0]} is not read: {unread[1]}"
 
 
 def recorded_drive(draft: SceneDraft, named: str | None = None) -> RecordedLog:

@@ -28,6 +28,7 @@ from alpasim_plugin.gaussians.fit.photographs import (
     read_posed_photographs,
 )
 from alpasim_plugin.gaussians.sh import C0
+from scenarios.unread_forms import unread_form
 
 # Pairs of photographs that the axes are tried on.
 PAIRS = 6
@@ -62,6 +63,9 @@ def read_source(folder: Path, need_files: bool = True) -> SourceDrive:
             return read_py123d(folder)
         if models_in(folder):
             return read_colmap(folder, need_files=need_files)
+    unread = unread_form(folder)
+    if unread is not None:
+        raise InputError(f"{folder}: {unread[0]}, which is not read", unread[1])
     raise InputError(f"{folder}: {contents(folder)}: no known form of a drive", f"give {FORMS}")
 
 

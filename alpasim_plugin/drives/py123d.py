@@ -47,15 +47,19 @@ LABELS = {
     "t": "truck",
     "y": "cyclist",
 }
+EGO_BOX = "e"  # the letter of the ego's own box, which is no other road user
 # The labels of each data set's classes, in the order of their numbers.
 CLASSES = {
     "AV2SensorBoxDetectionLabel": "obyyotboootoommppocboopotttpyy",
-    "DefaultBoxDetectionLabel": "ccoypooooooo",
+    "DefaultBoxDetectionLabel": "ecoypooooooo",
+    "GriffinBoxDetectionLabel": "pctbmy",
     "KITTI360BoxDetectionLabel": "yobctompoyooootooto",
     "NuPlanBoxDetectionLabel": "cypoooo",
     "NuScenesBoxDetectionLabel": "ctbbttctympppppppoooooo",
+    "NureasoningBoxDetectionLabel": "cypooootbmypo",
     "PandasetBoxDetectionLabel": "ooybcoottmmtycpppcoootooooo",
     "PhysicalAIAVBoxDetectionLabel": "cpbtcoyptoob",
+    "WODMotionBoxDetectionLabel": "ocpyo",
     "WODPerceptionBoxDetectionLabel": "ocpoy",
 }
 
@@ -271,6 +275,9 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
             table = np.array(tracks[token], np.float64).reshape(-1, 12)
             number = int(table[0, 11])
             letter = _numbered(CLASSES[kind], number, "label") if kind in CLASSES else "o"
+            if letter == EGO_BOX:
+                notes.append(f"boxes of the ego itself, track {token}, are left out")
+                continue
             times = table[:, 0].astype(np.int64)
             location = f"{path}, track {token}"
             track = checked_trajectory(location, times, table[:, 1:4], table[:, 4:8])

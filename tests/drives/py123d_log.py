@@ -42,6 +42,7 @@ def write_py123d(
     implicit_poses: bool = False,
     label: int = 0,
     first_frame: int = 0,
+    classes: str = "NuScenes",
 ) -> Path:
     """Write the street with a car that drives ahead at 5 m/s and one that stands.
 
@@ -51,6 +52,7 @@ def write_py123d(
         implicit_poses: Leave the cameras' poses to those of the ego.
         label: Number of the moving car's class.
         first_frame: Of the film, by the log's numbers.
+        classes: Data set whose classes the numbers are.
     """
     (folder / "samples").mkdir(parents=True)
     street = Street()
@@ -114,11 +116,10 @@ def write_py123d(
         parked = np.eye(4)
         parked[:3, 3] = 16.0, 2.9, 1.0
         boxes.append([[*_placed(T), 4.0, 1.8, 1.5] for T in (mover, parked)])
-    classes = "py123d.parser.registry.NuScenesBoxDetectionLabel"
     write_modality(
         folder,
         "box_detections_se3",
-        {"box_detection_label_class": classes},
+        {"box_detection_label_class": f"py123d.parser.registry.{classes}BoxDetectionLabel"},
         {
             "timestamp_us": (pa.int64(), times),
             "bounding_box_se3": (pa.list_(pa.list_(pa.float64(), 10)), boxes),

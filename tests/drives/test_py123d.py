@@ -116,3 +116,18 @@ def test_columns_and_facts_that_are_not_read_are_named(tmp_path, log):
     for name in ("camera@readout_us", "camera/exposure_us", "log/lidar.lidar_top"):
         assert f"{name} (1)" in notes
     assert "camera/data" not in notes
+
+
+def test_the_box_of_the_ego_itself_is_no_road_user(tmp_path):
+    drive = read_source(write_py123d(tmp_path / "log", classes="Default", label=0))
+    assert not drive.actors
+    assert "track a1, are left out" in str(drive.notes)
+
+
+@pytest.mark.parametrize(
+    ("classes", "label", "expected"),
+    [("WODMotion", 3, "cyclist"), ("Griffin", 3, "bus"), ("Nureasoning", 9, "motorcycle")],
+)
+def test_classes_of_data_sets_that_version_0_7_added(tmp_path, classes, label, expected):
+    drive = read_source(write_py123d(tmp_path / "log", classes=classes, label=label))
+    assert [actor.label for actor in drive.actors] == [expected]

@@ -20,6 +20,7 @@ from alpasim_plugin.drives.source import Points, checked
 from alpasim_plugin.drives.splat import _in_frame
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.fit.quality import Comparison
+from scenarios.sources import import_advice
 from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street, edited
 
 STEP_M = 1.2
@@ -600,3 +601,22 @@ def test_a_focal_length_and_an_angle_of_view_that_disagree_are_said(tmp_path, ke
     agreeing = {"camera_angle_x": 2 * float(np.arctan(0.5 * WIDTH / FOCAL))}
     calm = read_source(transforms(tmp_path / "b", NAMES, **agreeing), need_files=False)
     assert not any("disagree" in note for note in calm.notes)
+
+
+@pytest.mark.parametrize(
+    ("entry", "form"),
+    [
+        ("keyframes/cameras/1.json", "Polycam"),
+        ("EXR_RGBD/rgb/0.jpg", "Record3D"),
+        ("data_poses/2013_sync/poses.txt", "KITTI-360"),
+        ("rlog.zst", "openpilot"),
+        ("scenario_0a1e.parquet", "motion forecasting"),
+        ("segment-1.tfrecord", "Waymo"),
+    ],
+)
+def test_forms_without_a_reader_are_refused_by_their_names(tmp_path, entry, form):
+    (tmp_path / entry).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / entry).write_bytes(b"")
+    with pytest.raises(InputError, match=form):
+        read_source(tmp_path)
+    assert form in str(import_advice(tmp_path))
