@@ -8,6 +8,7 @@ a node that differs ends the run with an error that names it.
 
 import logging
 import os
+import pickle
 import signal
 import socket
 import tempfile
@@ -15,15 +16,14 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
-from alpasim_plugin.core.files import file_sha256, read_bytes
+from alpasim_plugin.core.files import content_of, read_bytes
 from alpasim_plugin.core.files.atomic import disk_error
+from alpasim_plugin.core.files.inputs import ABSENT
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
@@ -34,13 +34,14 @@ from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifes
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.cell import run_cell
 from alpasim_plugin.runs.executor_choice import Executor
-from alpasim_plugin.runs.local_executor import Lost, limited
+from alpasim_plugin.runs.local_executor import THREAD_VARIABLES, Lost, limited
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 from alpasim_plugin.runs.provenance import versions
 
 RETRIES = 2  # of a rollout whose worker or node died
 GIB = 2**30
 MISSING = "not there"
+LISTENING_S = 10.0  # how long the head of a cluster may take to accept a connection
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,18 @@ def connected(address: str) -> Iterator[Any]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    named = address or os.environ.get("RAY_ADDRESS", "")
     try:
+        require_listening(named)
         try:
             ray.init(address=address or "auto", **quiet)
         except ConnectionError:
-            if address:
+            if named:
                 raise
             ray.init(address="local", num_cpus=usable_cores(), include_dashboard=False, **quiet)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise InfrastructureError(
-            f"--executor ray: no cluster at {address or 'this machine'}: {error}",
+            f"--executor ray: no cluster at {named or 'this machine'}: {error}",
             "start the cluster (ray start --head), or correct the address",
         ) from error
     finally:
@@ -90,6 +93,20 @@ def connected(address: str) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def require_listening(address: str) -> None:
+    """Refuse the address of a cluster at which nobody listens: Ray itself would wait for minutes.
+
+    Args:
+        address: ``HOST:PORT``, or ``ray://HOST:PORT``; other words, which Ray knows, pass.
+
+    Raises:
+        OSError: Nobody listens.
+    """
+    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), LISTENING_S).close()
 
 
 def run_on_ray(
@@ -121,8 +138,9 @@ def run_on_ray(
             num_gpus=executor.gpus,
             memory=int(executor.memory_gib * GIB) or None,
             max_retries=RETRIES,
+            runtime_env={"env_vars": dict.fromkeys(THREAD_VARIABLES, str(executor.cores))},
         )
-        expected = ray.put(identity_of(plan.parts))
+        expected = ray.put(identity_of(*names_of(plan.parts)))
         scenarios = {name: ray.put(plan.scenarios[name]) for name in {cell.scene for cell in todo}}
         waiting = deque(todo)
         running: dict[Any, Cell] = {}
@@ -131,15 +149,9 @@ def run_on_ray(
                 while waiting and len(running) < workers:
                     cell = waiting.popleft()
                     scenario = scenarios[cell.scene]
-                    task = drive.remote(
-                        cell,
-                        plan.options,
-                        executor.cores,
-                        scenario,
-                        plan.parts,
-                        expected,
-                        limit_s,
-                    )
+                    # As bytes: a node without the code of a part cannot read the cell.
+                    job = pickle.dumps((cell, plan.options, executor.cores, limit_s))
+                    task = drive.remote(job, scenario, names_of(plan.parts), expected)
                     running[task] = cell
                 for task in ray.wait(list(running), num_returns=1)[0]:
                     yield running.pop(task), _result(ray, task, root)
@@ -185,23 +197,30 @@ def _result(ray: Any, task: Any, root: Path) -> JsonObject | Lost:
 
 
 def drive_on_node(
-    cell: Cell,
-    options: RunOptions,
-    threads: int,
+    job: bytes,
     scenario: Scenario,
-    parts: Sequence[PartSpec],
+    names: tuple[Sequence[str], Sequence[str]],
     expected: Mapping[str, str],
-    limit_s: float | None,
 ) -> DrivenRollout | SimrunError:
-    """Drive a rollout on this node; an error of the node is returned, since Ray would wrap it."""
+    """Drive a rollout on this node; an error of the node is returned, since Ray would wrap it.
+
+    Args:
+        job: The pickled cell, with the options of the run, the threads and the limit of time.
+        scenario: What is driven.
+        names: Of the run's parts, as `names_of` gives them.
+        expected: The `identity_of` the machine that gave the command.
+    """
     own_path_only()  # Ray adds the driver's working directory
     name = socket.gethostname()
-    differences = differences_of(expected, identity_of(tuple(parts)))
+    differences = differences_of(expected, identity_of(*names))
     if differences:
         return InfrastructureError(
             f"node {name} differs from this machine: {'; '.join(differences)}",
             "install the same versions and files on all nodes",
         )
+    cell: Cell
+    options: RunOptions
+    cell, options, threads, limit_s = pickle.loads(job)
     try:
         with tempfile.TemporaryDirectory(prefix="simrun-rollout-") as scratch:
             root = Path(scratch)
@@ -215,30 +234,39 @@ def drive_on_node(
         return disk_error(Path(tempfile.gettempdir()), error)
 
 
-def identity_of(parts: Sequence[PartSpec]) -> dict[str, str]:
-    """Return what must be the same on all machines of a run: name -> version or digest."""
-    part_digests = {}
-    for part in parts:
-        if part.target.partition(".")[0] not in OWN_PACKAGES:
-            part_digests[f"code of {part.target}"] = _code_of(part.target)
-        part_digests |= {path: _sha256_of(path) for path in part.files}
-    return versions() | {"code of simrun": package_digest()[:12]} | part_digests
+def names_of(parts: Sequence[PartSpec]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the targets of the parts that are not simrun's, and the files of all parts."""
+    users = [part.target for part in parts if part.is_users]
+    return tuple(users), tuple(path for part in parts for path in part.files)
+
+
+def identity_of(targets: Sequence[str], files: Sequence[str]) -> dict[str, str]:
+    """Return what must be the same on all machines of a run: name -> version or digest.
+
+    Args:
+        targets: Of parts that are not simrun's.
+        files: Of all parts.
+    """
+    code = {f"code of {target}": _code_of(target) for target in targets}
+    contents = {path: _content_of(path) for path in files}
+    return versions() | {"code of simrun": package_digest()[:12]} | code | contents
 
 
 def _code_of(target: str) -> str:
     try:
         file = file_of(target)
-    except ImportError:
+        return "compiled" if file is None else code_digest(file)[:12]
+    except (ImportError, InputError):
         return MISSING
-    return "compiled" if file is None else code_digest(file)[:12]
 
 
-@cache
-def _sha256_of(path: str) -> str:
+def _content_of(path: str) -> str:
+    """Return the digest of a file as it is now: a process may outlive a training."""
     try:
-        return file_sha256(path)[:12]
+        content = content_of(path)
     except InputError:
         return MISSING
+    return MISSING if content == ABSENT else content[:12]
 
 
 def differences_of(expected: Mapping[str, str], present: Mapping[str, str]) -> list[str]:

@@ -4,6 +4,8 @@
 """
 
 import os
+import pickle
+import socket
 
 import pytest
 
@@ -46,12 +48,15 @@ def test_a_cluster_gives_the_run_of_one_process(tmp_path, cluster):
 
 
 @pytest.mark.slow
-def test_a_rollout_that_kills_its_workers_fails_alone(tmp_path, cluster):
+def test_a_rollout_that_kills_its_workers_is_lost_alone(tmp_path, cluster):
+    """A run checks the policy here first, and does not drive it."""
     refs = expand("smoke/straight", SHORT)
     plan = make_plan(refs, (GREY,), ("constant-velocity", KILLER), (0,), RunOptions())
-    result, announced = drive(plan, tmp_path, Executor("ray"))
-    assert sorted(announced.results) == [("failed", False), ("ok", False)]
-    assert result.exit_code == 4
+    cells = plan.cells
+    results = ray_backend.run_on_ray(plan, cells, tmp_path, Executor("ray"), 2, None)
+    by_policy = {cell.policy.name: result for cell, result in results}
+    assert by_policy["constant-velocity"]["status"] == "ok"
+    assert "3 workers died" in by_policy[KILLER].reason
 
 
 @pytest.mark.slow
@@ -60,18 +65,74 @@ def test_more_than_any_node_has_is_an_error(tmp_path, cluster):
         drive(plan_of(), tmp_path, Executor("ray", cores=4096))
 
 
+def job_of(plan):
+    """Return what a node is given: the first rollout, its scene, the names of the parts."""
+    cell = plan.cells[0]
+    names = ray_backend.names_of(plan.parts)
+    return pickle.dumps((cell, plan.options, 1, None)), plan.scenarios[cell.scene], names
+
+
 def test_a_node_that_differs_drives_nothing(tmp_path):
     plan = plan_of()
-    cell = plan.cells[0]
-    scenario = plan.scenarios[cell.scene]
-    expected = ray_backend.identity_of(plan.parts)
+    job, scenario, names = job_of(plan)
+    expected = ray_backend.identity_of(*names)
     wrong = {**expected, "numpy": "0.0.1"}
-    refused = ray_backend.drive_on_node(cell, plan.options, 1, scenario, plan.parts, wrong, None)
+    refused = ray_backend.drive_on_node(job, scenario, names, wrong)
     assert isinstance(refused, InfrastructureError)
-    driven = ray_backend.drive_on_node(cell, plan.options, 1, scenario, plan.parts, expected, None)
+    driven = ray_backend.drive_on_node(job, scenario, names, expected)
     assert isinstance(driven, ray_backend.DrivenRollout)
     assert ray_backend.write_rollout(driven, tmp_path)["status"] == "ok"
-    assert (tmp_path / cell.folder / "rollout.asl").is_file()
+    assert (tmp_path / plan.cells[0].folder / "rollout.asl").is_file()
+
+
+USERS = """
+from pathlib import Path
+from policies.simple import ConstantVelocity
+
+class Mine(ConstantVelocity):
+    files = (Path(__file__).with_name("weights.bin"),)
+"""
+
+
+def test_a_node_without_a_policys_file_is_named_and_so_is_one_with_other_weights(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(USERS)
+    weights = tmp_path / "weights.bin"
+    weights.write_bytes(b"first")
+    plan = plan_of((f"{file}:Mine",))
+    job, scenario, names = job_of(plan)
+    expected = ray_backend.identity_of(*names)
+    assert ray_backend.identity_of(*names) == expected
+    weights.write_bytes(b"trained again")
+    retrained = ray_backend.identity_of(*names)
+    assert ray_backend.differences_of(expected, retrained) != []
+    assert ray_backend.differences_of(retrained, ray_backend.identity_of(*names)) == []
+    file.unlink()
+    weights.unlink()
+    refused = ray_backend.drive_on_node(job, scenario, names, expected)
+    assert isinstance(refused, InfrastructureError)
+    assert f"node {socket.gethostname()} differs" in refused.message
+    assert f"code of {file}:Mine is not there" in refused.message
+    assert f"{weights} is not there" in refused.message
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "[::1]:1", "ray://127.0.0.1:1"])
+def test_a_cluster_at_which_nobody_listens_is_refused_at_once(address):
+    with pytest.raises(OSError, match=r"refused|assign"):
+        ray_backend.require_listening(address)
+
+
+@pytest.mark.parametrize("address", ["", "auto", "local"])
+def test_what_ray_looks_up_itself_is_left_to_it(address):
+    ray_backend.require_listening(address)
+
+
+def test_a_dead_cluster_of_the_environment_fails_and_nothing_is_driven_here(tmp_path, monkeypatch):
+    pytest.importorskip("ray", reason="the extra [ray] is not installed")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    with pytest.raises(InfrastructureError, match=r"127\.0\.0\.1:1"):
+        drive(plan_of(), tmp_path, Executor("ray"))
+    assert list(tmp_path.rglob("rollout.asl")) == []
 
 
 @pytest.mark.parametrize(
