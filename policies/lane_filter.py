@@ -245,7 +245,7 @@ def _residuals(mean: F64, x: F64, y: F64, basis: F64) -> tuple[F64, F64, F64]:
 def _length(x: F64, rows: F64, used: Bool) -> float:
     """Return the metres of road over which at least one used point lies."""
     used_rows = x[used]
-    is_new = np.ones(len(used_rows), bool)
+    is_new = np.ones(len(used_rows), dtype=bool)
     np.not_equal(used_rows[1:], used_rows[:-1], out=is_new[1:])
     return float(rows[used][is_new].sum())
 

@@ -15,7 +15,7 @@ PARTS = 32  # of a pixel, between which OpenCV interpolates
 # Grey levels
 MEAN = 115.0
 STD = 64.0
-GREY = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601
+GREY = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 
 
 Cut = Callable[[Tensor], Tensor]  # a view of an image (H, W, 3) uint8: whole levels (3, h, w)

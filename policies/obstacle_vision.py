@@ -169,7 +169,7 @@ def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:
     """Return the integral image ``(R + 1, U + 1)``, over grid rows and image columns, of the
     anomaly in 0..1 that is at least so wide.
     """
-    bar = np.ones((1, round(width_m / CELL_M) | 1), np.uint8)
+    bar = np.ones((1, round(width_m / CELL_M) | 1), dtype=np.uint8)
     sight_values = np.take(cv2.morphologyEx(value, cv2.MORPH_OPEN, bar), grid.sight_index)
     table = cv2.integral(sight_values, sdepth=cv2.CV_64F)
     return np.divide(table, 255.0, out=table)

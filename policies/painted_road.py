@@ -115,7 +115,7 @@ class PaintedRoad:
             rotation[i, 0] * across[None, :] + (rotation[i, 1] * down + rotation[i, 2])[:, None]
             for i in range(3)
         ]
-        image = np.empty((len(v), len(u), 3), np.float32)
+        image = np.empty((len(v), len(u), 3), dtype=np.float32)
         image[:] = SKY
         ground = ray[2] < -T[2, 3] / 400.0
         depth = -T[2, 3] / ray[2][ground]
@@ -137,4 +137,4 @@ class PaintedRoad:
                 paint[paint] = np.mod(s_m[paint], PERIOD_M) < DASH_M
             index[paint] = len(mark_types)
             mark_types.append(line.colour)
-        return np.array(mark_types, np.float32)[index]
+        return np.array(mark_types, dtype=np.float32)[index]

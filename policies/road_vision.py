@@ -198,7 +198,7 @@ class RidgeFilter:
         """
         total = _running_sums(value)
         n = value.shape[1]
-        out = np.zeros(value.shape, np.float32)
+        out = np.zeros(value.shape, dtype=np.float32)
         for rows, half, gap, flank in self._runs:
             reach = gap + flank
             if 2 * reach >= n:
@@ -272,7 +272,7 @@ def find_paint(
     # Lane markings are long and noise is not: average over three rows before looking for maxima.
     smooth = cv2.blur(response, (1, 3))
     near = round(MERGE_M / CELL_M)
-    peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), np.uint8))
+    peak = cv2.dilate(smooth, np.ones((1, 2 * near + 1), dtype=np.uint8))
     # The median, of an odd number of columns
     spread = np.sort(smooth, axis=1)[:, smooth.shape[1] // 2]
     threshold = np.maximum(MIN_CONTRAST, NOISE_FACTOR * spread)
@@ -306,7 +306,7 @@ def _cells_around(
     """Return the cells ``(R, C)`` within `BAR_HALF_M` of bars, on rows where they make a
     crosswalk.
     """
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros(shape, dtype=np.uint8)
     if len(rows):
         count = np.bincount(rows, minlength=shape[0])
         high = np.full(shape[0], -np.inf)
@@ -315,5 +315,5 @@ def _cells_around(
         np.minimum.at(low, rows, y)
         wide = (count >= 4) & (high - low > CROSSWALK_M)
         mask[rows[wide[rows]], columns[wide[rows]]] = 1
-        mask = cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), np.uint8))
+        mask = cv2.dilate(mask, np.ones((1, 2 * round(BAR_HALF_M / CELL_M) + 1), dtype=np.uint8))
     return mask > 0

@@ -224,8 +224,8 @@ def read_ground(
         # Pixel = s * (R city + t), so city = R^T (pixel / s - t); block centres lie at half-integer
         # pixels.
         pixel = np.stack([columns, rows], axis=1)
-        city = (pixel / float(sim2["s"]) - np.array(sim2["t"], np.float64)) @ np.array(
-            sim2["R"], np.float64
+        city = (pixel / float(sim2["s"]) - np.array(sim2["t"], dtype=np.float64)) @ np.array(
+            sim2["R"], dtype=np.float64
         ).reshape(2, 2)
     grid = near(raster_path, np.column_stack([city, heights]) - origin)
     return from_points(
@@ -257,7 +257,7 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
 def _line(files: SourceFiles, location: str, raw: JsonObject, key: str, origin: F64) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
     with parsing(f"{location}, {key}", "give a list of at least two points with x, y and z"):
-        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], np.float64)
+        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64)
         if len(points) < 2:
             raise ValueError(f"{len(points)} points")
         return near(location, points - origin)

@@ -272,7 +272,7 @@ def _line(element: Element, name: str, least: int) -> F64:
     points = [point(one) for one in element.findall(f"{name}/point")]
     if len(points) < least:
         raise ValueError(f"{name} with {len(points)} points, at least {least} are needed")
-    return np.array(points, np.float64)
+    return np.array(points, dtype=np.float64)
 
 
 def _traffic_lights(path: Path, root: Element) -> tuple[dict[str, Cycle], list[str]]:

@@ -209,13 +209,13 @@ def read_drive(folder: Path) -> RecordedLog:
 
 
 def _trajectory(path: Path, track: JsonObject) -> Trajectory:
-    t_us = np.array(track["t_us"], np.int64)
+    t_us = np.array(track["t_us"], dtype=np.int64)
     return checked_trajectory(path, t_us, _rows(track["xyz"]), _rows(track["quat"], 4), least=2)
 
 
 def _rows(values: Any, width: int = 3) -> F64:
     """Return rows ``(N, width)``; rows of different lengths are an error of shape."""
-    return np.array(values, np.float64).reshape(-1, width)
+    return np.array(values, dtype=np.float64).reshape(-1, width)
 
 
 def _map_of(document: JsonObject) -> LaneMap:
@@ -252,7 +252,7 @@ def _signal(fields: JsonObject) -> Signal:
             "stop": _rows(fields["stop"]),
             "phases": phases,
             "lanes": tuple(fields["lanes"]),
-            "head": None if head is None else np.array(head, np.float64),
+            "head": None if head is None else np.array(head, dtype=np.float64),
         }
     )
 
@@ -260,7 +260,7 @@ def _signal(fields: JsonObject) -> Signal:
 def _ground_of(files: SourceFiles, folder: Path, grid: JsonObject) -> HeightField:
     path = folder / GROUND_FILE
     files.note_bytes(GROUND_FILE, files.read_bytes(path))
-    z = np.array(open_npy(path, DO_THIS), np.float64)
+    z = np.array(open_npy(path, DO_THIS), dtype=np.float64)
     if z.ndim != 2 or min(z.shape) < 2:
         raise InputError(f"{path}: heights of shape {z.shape}", DO_THIS)
     return HeightField(grid["x0_m"], grid["y0_m"], grid["cell_m"], z)

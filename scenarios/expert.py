@@ -85,7 +85,7 @@ class ScriptedTracks:
         self.xy = np.zeros((n, len(going), 2))
         self.yaw = np.zeros((n, len(going)))
         self.velocity = np.zeros((n, len(going), 2))
-        self.present = np.zeros((n, len(going)), np.bool_)
+        self.present = np.zeros((n, len(going)), dtype=np.bool_)
         for j, script in enumerate(going):
             track = script.track
             first_us = int(track.t_us[0])
@@ -257,7 +257,7 @@ def drive(
             car.advance(DECISION_US * 1e-6)
         if expert.front_s + 1.0 > path.length_m:
             break
-    t_us = np.array(log_t, np.int64)
+    t_us = np.array(log_t, dtype=np.int64)
     times = t_us[:: DECISION_US // LOG_STEP_US]
     keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
     xyz, yaw = path.at(np.array(log_s)[keep])

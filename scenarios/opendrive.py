@@ -196,7 +196,7 @@ def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
     origin = geographic_origin(geo_reference)
     if origin is None:
         return np.eye(4)
-    return np.asarray(np.linalg.inv(T_enu_earth(*origin) @ T_earth_local), np.float64)
+    return np.asarray(np.linalg.inv(T_enu_earth(*origin) @ T_earth_local), dtype=np.float64)
 
 
 def geographic_origin(geo_reference: str) -> tuple[float, float, float] | None:

@@ -543,7 +543,7 @@ def _cubics(owner: Element, place: str, start_key: str = "s", start_m: float = 0
         [start_m + _number(record, start_key), *(_number(record, name, 0.0) for name in _ABCD)]
         for record in owner.findall(place)
     ]
-    return np.array(sorted(rows, key=lambda row: row[0]), np.float64).reshape(-1, 5)
+    return np.array(sorted(rows, key=lambda row: row[0]), dtype=np.float64).reshape(-1, 5)
 
 
 def _signal(place: Element, nature: Element) -> RoadSignal:

@@ -374,7 +374,7 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
 
 
 def _points(vectors: Any) -> F64:
-    return np.array([(one.x, one.y, one.z) for one in vectors], np.float64).reshape(-1, 3)
+    return np.array([(one.x, one.y, one.z) for one in vectors], dtype=np.float64).reshape(-1, 3)
 
 
 def _mark_type(border: Any) -> LaneMarkType:

@@ -227,7 +227,7 @@ def checked_trajectory(
             row = int(np.argmax(bad))
             raise InputError(f"{path}: {fault} in row {row}", "repair or drop these rows")
     return Trajectory(
-        np.ascontiguousarray(t_us, np.int64), np.ascontiguousarray(xyz), quat / norms[:, None]
+        np.ascontiguousarray(t_us, dtype=np.int64), np.ascontiguousarray(xyz), quat / norms[:, None]
     )
 
 

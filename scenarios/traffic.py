@@ -144,7 +144,7 @@ def _scripted(placer: _Placer, actor: ActorSpec) -> list[Actor]:
         case ParkedActor():
             return _parked(placer, actor, box)
         case LoggedActor():
-            points = np.array(actor.points, np.float64)
+            points = np.array(actor.points, dtype=np.float64)
             t_us = np.round(points[:, 0] * 1e6).astype(np.int64)
             xyz = np.column_stack([points[:, 1:3], np.full(len(points), box.height_m / 2)])
             track = Trajectory(t_us, xyz, quat_from_yaw(points[:, 3]))

@@ -183,7 +183,7 @@ def _road(archive: Archive, rig: JsonObject) -> RoadMap:
     location = f"{archive.path}, map.xodr"
     odr = parse_map(location, parse_xml(archive.read("map.xodr"), location))
     with parsing(f"{archive.path}, {RIG}", "give T_world_base, 4 x 4"):
-        T_earth_local = np.array(rig["T_world_base"], np.float64).reshape(4, 4)
+        T_earth_local = np.array(rig["T_world_base"], dtype=np.float64).reshape(4, 4)
         place = T_local_map(odr.geo_reference, T_earth_local)
     lane_map, more = lane_map_of(location, odr, place)
     return RoadMap(lane_map, alpasim_map(odr, place), (*notes, *more))
@@ -191,8 +191,8 @@ def _road(archive: Archive, rig: JsonObject) -> RoadMap:
 
 def _ego_log(rig: JsonObject, location: str) -> Trajectory:
     """Return the recorded drive."""
-    t_us = np.array(rig["T_rig_world_timestamps_us"], np.int64)
-    poses = np.array(rig["T_rig_worlds"], np.float64).reshape(len(t_us), 4, 4)
+    t_us = np.array(rig["T_rig_world_timestamps_us"], dtype=np.int64)
+    poses = np.array(rig["T_rig_worlds"], dtype=np.float64).reshape(len(t_us), 4, 4)
     turned = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0)
     if not turned.max(initial=0.0) < 1e-3:
         raise InputError(
@@ -231,7 +231,7 @@ def _vehicle(rig: JsonObject, location: str) -> tuple[Vehicle, tuple[str, ...]]:
     ahead, left, up = map(float, box["centroid"])
     length, width, height = (round(float(side), 6) for side in box["dim"])
     above = up - height / 2
-    turn = np.abs(np.array(box.get("rot") or (0.0, 0.0, 0.0), np.float64))
+    turn = np.abs(np.array(box.get("rot") or (0.0, 0.0, 0.0), dtype=np.float64))
     if not turn.max(initial=0.0) < MOST_TURNED:
         raise InputError(
             f"{location}: rig_bbox, rot: {box['rot']}, a body that is turned against the rig",
@@ -262,8 +262,8 @@ def _actors(archive: Archive) -> tuple[Actor, ...]:
         for name, label, flags, times, poses, size in zip(*columns, sizes, strict=True):
             if str(name) in actors:
                 raise InputError(f"{location}: track {name!r} twice", "give each track its own id")
-            table = np.array(poses, np.float64).reshape(len(times), 7)
-            t_us = np.array(times, np.int64)
+            table = np.array(poses, dtype=np.float64).reshape(len(times), 7)
+            t_us = np.array(times, dtype=np.int64)
             xyz = table[:, :3].copy()
             quat = table[:, [6, 3, 4, 5]].copy()
             track = checked_trajectory(f"{location}, track {name}", t_us, xyz, quat)
@@ -323,7 +323,7 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
     line = np.concatenate(rows) if rows else np.zeros((0, 4))
     if not len(line) or not road.sections:
         return
-    s = np.asarray(STEP_M * np.arange(len(line)), np.float64)
+    s = np.asarray(STEP_M * np.arange(len(line)), dtype=np.float64)
     line[:, :2] = beside(line[:, :3], cubics_at(road.lane_offset, s))
     z = line[:, 3]
     by_id: dict[int, list[F64]] = {}
@@ -394,7 +394,7 @@ def _without_duplicates(edges: Mapping[str, F64]) -> dict[str, F64]:
     or their middles within 1 m.
     """
     keys = list(edges)
-    lines = np.array([shapely.linestrings(edges[k][:, :2]) for k in keys], object)
+    lines = np.array([shapely.linestrings(edges[k][:, :2]) for k in keys], dtype=object)
     length = shapely.length(lines)
     middle = shapely.get_coordinates(shapely.centroid(lines))
     chord = np.array([edges[k][-1, :2] - edges[k][0, :2] for k in keys]).reshape(-1, 2)

@@ -141,7 +141,7 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
 def points(raw: Any) -> F64:
     """Return points ``(N, 3)`` of a list of structs or of a struct of lists."""
     columns = [raw[axis] if isinstance(raw, dict) else [p[axis] for p in raw] for axis in "xyz"]
-    xyz = np.array(columns, np.float64).T
+    xyz = np.array(columns, dtype=np.float64).T
     if not np.ptp(xyz, axis=0).max(initial=0.0) <= MAX_REACH_M:
         raise ValueError("points that are not finite or kilometres apart")
     return xyz

@@ -232,7 +232,7 @@ def ground_mesh(scenario: Scenario) -> bytes:
     faces = np.concatenate(
         [np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])]
     )
-    table = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", (3,))])
+    table = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
     table["n"], table["v"] = 3, faces
     head = (
         "ply\nformat binary_little_endian 1.0\n"

@@ -127,7 +127,7 @@ def to_clip(views: Views, frames_due: int, device: torch.device | str = "cpu") -
             x = torch.cat([x, x[:, :, -1:].expand(-1, -1, short, -1, -1)], dim=2)
         return pad_clip(x, group=1, side=TOKEN_PX)[0]
 
-    alpha = np.ones(views.rgb.shape[:-1], np.float32) if views.alpha is None else views.alpha
+    alpha = np.ones(views.rgb.shape[:-1], dtype=np.float32) if views.alpha is None else views.alpha
     maps = None if views.maps is None else video(views.maps)
     return Clip(video(views.rgb), video(alpha[..., None]), maps)
 

@@ -225,7 +225,7 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
     if sides[0].resample is None:
         return first
     events = dict.fromkeys(event for frame in frames for event in frame.events)
-    blank = np.zeros((1, 1, 4), np.uint8)
+    blank = np.zeros((1, 1, 4), dtype=np.uint8)
     references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
     alphas = [frame.alpha for frame in frames]
     return replace(
@@ -258,8 +258,8 @@ def joined_image(
             out[~sides[0].visible] = outside
         return out
     shape = sides[0].height, sides[0].width
-    out = np.zeros((*shape, *images[0].shape[2:]), images[0].dtype)
-    weight_sum = np.zeros(shape, np.float32)
+    out = np.zeros((*shape, *images[0].shape[2:]), dtype=images[0].dtype)
+    weight_sum = np.zeros(shape, dtype=np.float32)
     end = 0  # of the columns that a pinhole before has filled
     for lens, image in zip(sides, images, strict=True):
         assert lens.weight is not None, "one of several pinholes"
@@ -284,7 +284,7 @@ def blind_of(sides: Sequence[Lens]) -> Bool | None:
     """Return where a lens sees nothing ``(height, width)``; None where it sees everywhere."""
     if sides[0].resample is None:
         return None
-    white = np.full((1, 1), 255, np.uint8)
+    white = np.full((1, 1), 255, dtype=np.uint8)
     blind = joined_image(sides, [white] * len(sides)) == 0
     return blind if blind.any() else None
 
@@ -374,7 +374,7 @@ def lens_shares(camera: CameraSpec, pinhole: Lens, along: Along, backwards: bool
         (camera.height, place[..., 1]) if along == "rows" else (camera.width, place[..., 0])
     )
     share = np.clip(position / max(count - 1, 1), 0, 1) if count > 1 else np.ones_like(position)
-    near = cv2.dilate(is_visible.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    near = cv2.dilate(is_visible.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
     return np.where(near, 1 - share if backwards else share, np.float32(np.nan)).astype(np.float32)
 
 

@@ -111,7 +111,7 @@ def joined(request: RenderRequest, exposed: Sequence[Band], parts: Sequence[Any]
     first = parts[0]
     shape = request.camera.height, request.camera.width, *first.shape[2:]
     on_host = isinstance(first, np.ndarray)
-    whole = np.zeros(shape, first.dtype) if on_host else first.new_zeros(shape)
+    whole = np.zeros(shape, dtype=first.dtype) if on_host else first.new_zeros(shape)
     for band, part in zip(exposed, parts, strict=True):
         band.put(whole, part)
     return whole
@@ -125,7 +125,7 @@ def bands_of(request: RenderRequest, count: int) -> Iterator[Band]:
     share = request.exposure.share
     height = request.camera.height
     width = request.camera.width
-    part = np.full(share.shape, -1, np.int32)
+    part = np.full(share.shape, -1, dtype=np.int32)
     np.minimum(share * count, count - 1, out=part, where=~np.isnan(share), casting="unsafe")
     for index in range(count):
         in_band = part == index
@@ -219,6 +219,10 @@ def rolling(width: int, height: int, along: Along, backwards: bool) -> F32:
         [0.0, 0.5, 1.0]
     """
     count = height if along == "rows" else width
-    share = np.linspace(0.0, 1.0, count, dtype=np.float32) if count > 1 else np.ones(1, np.float32)
+    share = (
+        np.linspace(0.0, 1.0, count, dtype=np.float32)
+        if count > 1
+        else np.ones(1, dtype=np.float32)
+    )
     share = share[::-1] if backwards else share
     return np.ascontiguousarray(share[:, None] if along == "rows" else share[None, :])

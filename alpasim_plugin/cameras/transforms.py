@@ -72,7 +72,7 @@ def _camera(document: JsonObject, location: str) -> CameraSpec:
     pose = frame["transform_matrix"]
     if [len(row) for row in pose] != [4, 4, 4, 4]:
         raise InputError(f"{location}, transform_matrix: not 4 x 4", DO_THIS)
-    T_rig_camera = np.array(pose, np.float64) * FLIPS[frame["axes"]]
+    T_rig_camera = np.array(pose, dtype=np.float64) * FLIPS[frame["axes"]]
     rotation = T_rig_camera[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (off < ROTATION_ERROR and np.linalg.det(rotation) > 0):

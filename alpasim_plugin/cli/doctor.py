@@ -82,7 +82,8 @@ def _fixer() -> str:
 
     fixer = make_fixer("onefixer", scene_id="doctor", threads=1)
     grey = [
-        Frame(i, "front", np.full((32, 48, 3), 40 * i, np.uint8)) for i in range(fixer.blocks.first)
+        Frame(i, "front", np.full((32, 48, 3), 40 * i, dtype=np.uint8))
+        for i in range(fixer.blocks.first)
     ]
     fixed = fixer.step(grey, [frame.rgb for frame in grey])
     refused = sum(bool(frame.events) for frame in fixed)
@@ -94,7 +95,7 @@ def _fixer() -> str:
 def _video() -> str:
     from alpasim_plugin.log.video import read_mp4, write_mp4
 
-    frames = [np.full((32, 48, 3), 40 * i, np.uint8) for i in range(4)]
+    frames = [np.full((32, 48, 3), 40 * i, dtype=np.uint8) for i in range(4)]
     with temporary_folder("simrun-doctor-") as folder:
         path = Path(folder) / "test.mp4"
         write_mp4(path, frames, 10)

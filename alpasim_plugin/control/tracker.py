@@ -53,7 +53,7 @@ HOLD_S = 2.0
 # Derivative of the steer at the start of step k by the change in step j.
 _BEFORE = np.tril(np.ones((NODES, NODES)), -1)
 _MIDDLE = _BEFORE + 0.5 * np.eye(NODES)
-_UP_TO = np.tril(np.ones((NODES, NODES), bool))
+_UP_TO = np.tril(np.ones((NODES, NODES), dtype=bool))
 
 
 def check_interval(state: EgoState, to_us: int) -> float:

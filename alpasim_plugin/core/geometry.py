@@ -22,12 +22,12 @@ def wrap_angle(angle_rad: npt.ArrayLike) -> F64:
         >>> float(wrap_angle(3 * np.pi / 2)) == -np.pi / 2
         True
     """
-    return (np.asarray(angle_rad, np.float64) + np.pi) % (2 * np.pi) - np.pi
+    return (np.asarray(angle_rad, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
 
 
 def quat_from_yaw(yaw_rad: npt.ArrayLike) -> F64:
     """Return ``(..., 4)`` unit quaternions of rotations about z by ``(...)`` angles."""
-    yaw = np.asarray(yaw_rad, np.float64)
+    yaw = np.asarray(yaw_rad, dtype=np.float64)
     quat = np.zeros((*yaw.shape, 4))
     quat[..., 0], quat[..., 3] = np.cos(yaw / 2), np.sin(yaw / 2)
     return quat
@@ -37,13 +37,13 @@ def yaw_from_quat(quat: npt.ArrayLike) -> F64:
     """Return the heading ``(...)`` of ``(..., 4)`` quaternions: the angle of body x in the world's
     xy plane.
     """
-    w, x, y, z = np.moveaxis(np.asarray(quat, np.float64), -1, 0)
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def matrix_from_quat(quat: npt.ArrayLike) -> F64:
     """Return rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, np.float64), -1, 0)
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=np.float64), -1, 0)
     entries = [
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),
@@ -64,7 +64,7 @@ def quat_from_matrix(rotation: npt.ArrayLike) -> F64:
     Takes the largest of the four candidate components, so it is stable at 180 degrees (Shepperd
     1978).
     """
-    m = np.asarray(rotation, np.float64)
+    m = np.asarray(rotation, dtype=np.float64)
     batch = m.shape[:-2]
     a, b, c, d, e, f, g, h, i = m.reshape(-1, 9).T
     trace = a + e + i
@@ -86,7 +86,7 @@ def se3(xyz: npt.ArrayLike, quat: npt.ArrayLike) -> F64:
     """Return ``(..., 4, 4)`` transforms from positions ``(..., 3)`` and quaternions ``(...,
     4)``.
     """
-    xyz_ = np.asarray(xyz, np.float64)
+    xyz_ = np.asarray(xyz, dtype=np.float64)
     out = np.zeros((*xyz_.shape[:-1], 4, 4))
     out[..., :3, :3] = matrix_from_quat(quat)
     out[..., :3, 3] = xyz_
@@ -194,7 +194,7 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
     Raises:
         InputError: A time lies outside ``[t_us[0], t_us[-1]]``; poses are never extrapolated.
     """
-    t = np.asarray(t_us, np.int64)
+    t = np.asarray(t_us, dtype=np.int64)
     first = int(trajectory.t_us[0])
     last = int(trajectory.t_us[-1])
     if t.size and (int(t.min()) < first or int(t.max()) > last):
@@ -218,9 +218,9 @@ def interpolate(trajectory: Trajectory, t_us: npt.ArrayLike) -> F64:
 
 def trajectory_from_poses(t_us: npt.ArrayLike, poses: npt.ArrayLike) -> Trajectory:
     """Build a trajectory from times ``(T,)`` and transforms ``(T, 4, 4)``."""
-    matrices = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+    matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     return Trajectory(
-        np.asarray(t_us, np.int64),
+        np.asarray(t_us, dtype=np.int64),
         matrices[:, :3, 3].copy(),
         quat_from_matrix(matrices[:, :3, :3]),
     )
@@ -259,7 +259,7 @@ def resample(line: F64, s_m: npt.ArrayLike, along: F64 | None = None) -> F64:
         keep = np.concatenate([[True], rises])
         s = s[keep]
         line = line[keep]
-    query_s_m = np.asarray(s_m, np.float64)
+    query_s_m = np.asarray(s_m, dtype=np.float64)
     out = np.empty((*query_s_m.shape, line.shape[1]))
     for d in range(line.shape[1]):
         out[..., d] = np.interp(query_s_m, s, line[:, d])

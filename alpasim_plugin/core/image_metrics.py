@@ -55,7 +55,7 @@ def ssim(image: Image, truth: Image, peak: float = 255.0) -> float:
         >>> round(ssim(ramp, ramp), 6)
         1.0
     """
-    a, b = (np.ascontiguousarray(x, np.float32) / np.float32(peak) for x in (image, truth))
+    a, b = (np.ascontiguousarray(x, dtype=np.float32) / np.float32(peak) for x in (image, truth))
     mu_a = gaussian_blur(a)
     mu_b = gaussian_blur(b)
     mu_ab = mu_a * mu_b

@@ -29,7 +29,7 @@ def derive_seed(scene_id: str, seed: int, component: str, step: int = 0) -> int:
 
 def stream(scene_id: str, seed: int, component: str, step: int = 0) -> np.random.Generator:
     """Return the random generator of one component at one step."""
-    key = np.frombuffer(_digest(scene_id, seed, component, step)[:16], np.uint64)
+    key = np.frombuffer(_digest(scene_id, seed, component, step)[:16], dtype=np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 
 

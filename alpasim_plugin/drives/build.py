@@ -322,7 +322,7 @@ def _points(drive: SourceDrive, folder: Path, tell: Report) -> Points:
     T = rough.T_world_source
     return points.joined(
         road_points(front, rough.poses[drive.front], rough.strip).moved(
-            np.asarray(np.linalg.inv(T), np.float64)
+            np.asarray(np.linalg.inv(T), dtype=np.float64)
         )
     )
 

@@ -299,7 +299,7 @@ def _of_line(record: Callable[[_Binary | _Words], T], words: Sequence[str]) -> T
 
 def _are_points(words: Sequence[str]) -> bool:
     try:
-        return len(words) % 3 == 0 and np.array(words, np.float64).size > 0
+        return len(words) % 3 == 0 and np.array(words, dtype=np.float64).size > 0
     except ValueError:
         return False
 

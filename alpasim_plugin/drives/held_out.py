@@ -29,8 +29,8 @@ def held_out(drive: SourceDrive, camera: str, stride: int) -> Bool:
     """
     count = len(drive.of(camera))
     if count < EVERY or camera in drive.never_fitted:
-        return np.zeros(count, np.bool_)
-    return np.asarray(np.arange(count) % stride == stride // 2, np.bool_)
+        return np.zeros(count, dtype=np.bool_)
+    return np.asarray(np.arange(count) % stride == stride // 2, dtype=np.bool_)
 
 
 def fitted_part(drive: SourceDrive, stride: int) -> SourceDrive:

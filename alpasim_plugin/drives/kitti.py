@@ -146,7 +146,7 @@ def _table(path: Path, columns: int, do_this: str) -> F64:
     for i, line in enumerate(read_text(path).splitlines()):
         if line.strip():
             with parsing(f"{path}, line {i + 1}", do_this, "not only numbers"):
-                rows.append(np.array(line.split(), np.float64).reshape(columns))
+                rows.append(np.array(line.split(), dtype=np.float64).reshape(columns))
     return np.array(rows).reshape(-1, columns)
 
 
@@ -186,7 +186,7 @@ def _projections(path: Path) -> tuple[dict[str, F64], list[str]]:
             raise InputError(f"{path}: a second row {name}", "give each camera one row")
         if re.fullmatch(r"P\d", name):
             with parsing(f"{path}, row {name}", ROW_OF_12):
-                rows[name] = np.array(words.split(), np.float64).reshape(3, 4)
+                rows[name] = np.array(words.split(), dtype=np.float64).reshape(3, 4)
     return rows, list(KITTI.notes(met))
 
 

@@ -121,7 +121,7 @@ def _samples(cloud: GaussianCloud) -> tuple[F64, F64]:
     """
     cloud = cloud.take((cloud.opacities > OPAQUE) & (cloud.scales.max(axis=1) < LARGEST_M))
     means, quats, scales, opacities = (
-        np.asarray(array, np.float64)
+        np.asarray(array, dtype=np.float64)
         for array in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
     )
     order = np.argsort(-scales, axis=1)[:, :2]

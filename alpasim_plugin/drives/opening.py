@@ -226,7 +226,7 @@ def _start_points(folder: Path, document: JsonObject) -> Points | None:
     path = inside(folder, folder / str(name), f"{folder / FILE}, ply_file_path")
     cloud = read_points(path)
     rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
-    xyz = np.asarray(cloud.means, np.float64)
+    xyz = np.asarray(cloud.means, dtype=np.float64)
     return Points(xyz, rgb, np.zeros((len(cloud), 3, 3)))
 
 

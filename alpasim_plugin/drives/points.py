@@ -109,7 +109,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     return Points(
         placement.xyz,
         colours,
-        np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, np.float64),
+        np.asarray(np.linalg.pinv(H, hermitian=True) * PIXEL_SPREAD**2, dtype=np.float64),
     ).chosen(good)
 
 
@@ -125,7 +125,7 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     """
     pairs = matches(views)
     if not pairs:
-        return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+        return Tracks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 0)
     ends = np.array(
         [[m.first, *m.at_first] for m in pairs] + [[m.second, *m.at_second] for m in pairs]
     )
@@ -313,7 +313,7 @@ def _piece_ahead(strip: GroundStrip, centre: F64, lateral: float) -> F64:
 def _mask(camera: PinholeCamera, piece: F64) -> U8:
     """Return where a photograph shows the piece, ``(H, W)``: 255 inside."""
     local = transform_points(camera.T_camera_world, piece)
-    mask = np.zeros((camera.height, camera.width), np.uint8)
+    mask = np.zeros((camera.height, camera.width), dtype=np.uint8)
     if (local[:, 2] > 1e-3).all():
         pixel = local @ camera.K.T
         hull = cv2.convexHull((pixel[:, :2] / pixel[:, 2:]).clip(-1e4, 1e4).astype(np.int32))

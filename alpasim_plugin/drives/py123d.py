@@ -101,7 +101,7 @@ def read_py123d(folder: Path) -> SourceDrive:
     with parsing(location, DO_THIS):
         if times.null_count:
             raise ValueError("a row without a time")
-        table = np.array(poses.to_pylist(), np.float64).reshape(-1, 7)
+        table = np.array(poses.to_pylist(), dtype=np.float64).reshape(-1, 7)
         ego = checked_trajectory(location, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
         for name in ("length", "width", "height", "wheel_base"):
             BODY_M.check(body[name], f"{location}: {name}")
@@ -272,7 +272,7 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
             notes.append(f"road users of the unknown classes {kind} are labelled 'other'")
         actors: list[Actor] = []
         for token in sorted(tracks):
-            table = np.array(tracks[token], np.float64).reshape(-1, 12)
+            table = np.array(tracks[token], dtype=np.float64).reshape(-1, 12)
             number = int(table[0, 11])
             letter = _numbered(CLASSES[kind], number, "label") if kind in CLASSES else "o"
             if letter == EGO_BOX:

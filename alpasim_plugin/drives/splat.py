@@ -106,7 +106,7 @@ def import_splat(
         placed = place(drive, points)
         _check_frame(file, placed)
         check_motion(drive, placed)
-        sky = Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32))
+        sky = Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32))
         model = Reconstruction(placed_cloud(cloud, placed.T_world_source), {}, sky)
         begin(work, key)
         stride = EVERY if placed.strip else EVERY_STILL
@@ -177,7 +177,7 @@ def _in_frame(
     if stated is not None:
         frames |= _T_trained_source(stated, drive)
     models = {
-        name: placed_cloud(cloud, np.asarray(np.linalg.inv(T), np.float64))
+        name: placed_cloud(cloud, np.asarray(np.linalg.inv(T), dtype=np.float64))
         for name, T in frames.items()
     }
     shares = {name: _covered(model, drive) for name, model in models.items()}
@@ -219,7 +219,7 @@ def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
 
 
 def _rigid(rows: Any) -> F64:
-    T = np.vstack([np.asarray(rows, np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
+    T = np.vstack([np.asarray(rows, dtype=np.float64)[:3], [0.0, 0.0, 0.0, 1.0]])
     require_rigid(T)
     return T
 
@@ -290,6 +290,6 @@ def _blank_views(drive: SourceDrive, placed: PlacedDrive) -> list[PosedView]:
     for photograph, pose in zip(drive.of(drive.front), placed.poses[drive.front], strict=True):
         lens = photograph.lens.resized(VIEW_PX)
         camera = PinholeCamera.from_pose(lens.width, lens.height, lens.straight_K(), pose)
-        blank = np.zeros((lens.height, lens.width, 3), np.uint8)
+        blank = np.zeros((lens.height, lens.width, 3), dtype=np.uint8)
         views.append(PosedView(camera, blank, photograph.file.stem))
     return views

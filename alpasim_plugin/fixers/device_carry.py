@@ -127,7 +127,7 @@ def _carry(views: Sequence[CarriedView]) -> Tensor:
     lifted = np.array([_lifted(view) for view in views])
     project = np.array([image.project for image in images])
     T_world_rig = np.array([view.T_world_rig for view in views])
-    sizes = np.array([image.depth.shape for image in images], np.float64)
+    sizes = np.array([image.depth.shape for image in images], dtype=np.float64)
     from_view, planes, sizes_px, *boxes = upload_together(
         [
             project.reshape(len(views), -1, 4) @ lifted,

@@ -68,8 +68,8 @@ def _uploaded(side: Lens, device: torch.device) -> tuple[Tensor, Tensor]:
     with which weight ``(h, w, 1)``.
     """
     assert side.resample is not None, "a pinhole that covers a lens"
-    place = (2 * side.resample + 1) / np.array(side.cover, np.float32) - 1
-    weight = np.ones(place.shape[:2], np.float32)
+    place = (2 * side.resample + 1) / np.array(side.cover, dtype=np.float32) - 1
+    weight = np.ones(place.shape[:2], dtype=np.float32)
     if side.weight is not None:
         weight = side.weight
     elif side.visible is not None:

@@ -44,7 +44,7 @@ PREFERENCE = 3
 NEAR_PREFERENCE = 10
 ABOUT = (0.75, 1.4)  # the render's depth as a share of the ground's
 FLOATING_M = 1.0  # nothing stands so near to a camera: it does not hide the ground
-GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], np.float32)
+GREY = np.array([[1 / 3, 1 / 3, 1 / 3, 0]], dtype=np.float32)
 SAMPLES = 15  # a larger window is sampled by so many rows and columns, or up to twice as many
 UNSEEN = 30  # grey levels: the disagreement of a pixel that one of the two frames does not show
 
@@ -129,7 +129,7 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
     down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
     height_m = T_world_rig[:3, 2] @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3])
-    out = np.empty(target.depth.shape, np.float32)
+    out = np.empty(target.depth.shape, dtype=np.float32)
     _ground(np.ascontiguousarray(target.depth), down, height_m, out)
     out[on_boxes(target.depth.shape, target.placed.boxes)] = 0
     return out

@@ -66,7 +66,7 @@ class ReferenceIndex:
         T = np.array([frame.T_world_camera for frame in recorded]).reshape(-1, 4, 4)
         self._centres = T[:, :3, 3]
         self._axes = T[:, :3, 2]
-        self._t_us: I64 = np.array([frame.t_us for frame in recorded], np.int64)
+        self._t_us: I64 = np.array([frame.t_us for frame in recorded], dtype=np.int64)
         self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
         self._lenses: dict[tuple[int, str], list[int]] = {}
         for i, frame in enumerate(recorded):

@@ -204,7 +204,7 @@ def _stack(
     frame_references = [] if references is not None else [_references(frame) for frame in frames]
     count = max(map(len, frame_references), default=0)
     if count:
-        references = np.zeros((len(frames), count, *shape[:2], 4), np.uint8)
+        references = np.zeros((len(frames), count, *shape[:2], 4), dtype=np.uint8)
         for i, images in enumerate(frame_references):
             for k, image in enumerate(images):
                 references[i, k] = image
@@ -255,7 +255,7 @@ def _opacity(frames: Sequence[Frame]) -> F32 | None:
     """Return the opacities of frames ``(N, H, W)``, None where every pixel is opaque."""
     if all(frame.alpha is None or frame.alpha.min() >= 1 for frame in frames):
         return None
-    alpha = np.ones((len(frames), *frames[0].size), np.float32)
+    alpha = np.ones((len(frames), *frames[0].size), dtype=np.float32)
     for i, frame in enumerate(frames):
         if frame.alpha is not None:
             np.clip(frame.alpha, 0, 1, out=alpha[i])

@@ -59,8 +59,10 @@ class PinholeCamera:
     rolling: Rolling | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "K", np.asarray(self.K, np.float64))
-        object.__setattr__(self, "T_camera_world", np.asarray(self.T_camera_world, np.float64))
+        object.__setattr__(self, "K", np.asarray(self.K, dtype=np.float64))
+        object.__setattr__(
+            self, "T_camera_world", np.asarray(self.T_camera_world, dtype=np.float64)
+        )
         if self.width < 1 or self.height < 1:
             raise InputError(
                 f"{self.width} x {self.height} pixels: no pixel",
@@ -89,8 +91,8 @@ class PinholeCamera:
         return cls(
             width,
             height,
-            np.asarray(K, np.float64),
-            inverse(np.asarray(T_world_camera, np.float64)),
+            np.asarray(K, dtype=np.float64),
+            inverse(np.asarray(T_world_camera, dtype=np.float64)),
         )
 
     def window(self, rows: slice, columns: slice) -> PinholeCamera:

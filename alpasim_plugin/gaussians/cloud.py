@@ -163,7 +163,7 @@ class GaussianCloud:
             unit = q / np.abs(q).max(axis=1, initial=0.0, keepdims=True)
             unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
         low = np.exp(-LOG_SCALE_LIMIT)
-        keep = np.ones(n, bool)
+        keep = np.ones(n, dtype=bool)
         dropped = {}
         for cause, bad in faults.items():
             dropped[cause] = int(np.count_nonzero(bad & keep))
@@ -179,7 +179,7 @@ class GaussianCloud:
         cloud = cls(
             raw.means[keep].astype(np.float64),
             unit[keep],
-            np.maximum(scales_kept, np.asarray(low, scales_kept.dtype)),
+            np.maximum(scales_kept, np.asarray(low, dtype=scales_kept.dtype)),
             np.clip(opacities_kept, 0, 1),
             raw.sh[keep],
         )
@@ -235,7 +235,7 @@ class GaussianCloud:
             InputError: ``T`` is not rigid.
         """
         require_rigid(T)
-        rotation = np.asarray(T[:3, :3], np.float64)
+        rotation = np.asarray(T[:3, :3], dtype=np.float64)
         means = self.means.astype(np.float64) @ rotation.T + T[:3, 3]
         quats = quat_multiply(quat_from_matrix(rotation), self.quats.astype(np.float64))
         return replace(self, means=means, quats=quats, sh=rotate_sh(self.sh, rotation))
@@ -291,7 +291,7 @@ def require_rigid(T: npt.ArrayLike, name: str = "a transform") -> None:
     """Raise `InputError` unless ``T`` is a finite ``(4, 4)`` rigid transform (rotation to 1e-5, no
     reflection, no scale).
     """
-    m = np.asarray(T, np.float64)
+    m = np.asarray(T, dtype=np.float64)
     fault = None
     if m.shape != (4, 4):
         fault = f"shape {m.shape}"
@@ -342,13 +342,13 @@ class GaussianArrays(NamedTuple):
 
 def sigmoid(x: FloatArray) -> F64:
     """Return the logistic function in float64, without overflow for large negative input."""
-    e = np.exp(-np.abs(np.asarray(x, np.float64)))
+    e = np.exp(-np.abs(np.asarray(x, dtype=np.float64)))
     return np.where(np.asarray(x) >= 0, 1.0 / (1.0 + e), e / (1.0 + e))
 
 
 def logit(p: FloatArray) -> F64:
     """Return the inverse of `sigmoid` in float64; 0 and 1 give minus and plus infinity."""
-    q = np.asarray(p, np.float64)
+    q = np.asarray(p, dtype=np.float64)
     with np.errstate(divide="ignore"):
         return np.log(q) - np.log1p(-q)
 
@@ -379,6 +379,6 @@ def build_cloud(arrays: GaussianArrays) -> tuple[GaussianCloud, CleanReport]:
 def placed_cloud(cloud: GaussianCloud, T_world_file: F64) -> GaussianCloud:
     """Move a cloud by a similarity transform; its colours turn with it."""
     scale = float(np.cbrt(np.linalg.det(T_world_file[:3, :3])))
-    rigid = np.asarray(T_world_file, np.float64).copy()
+    rigid = np.asarray(T_world_file, dtype=np.float64).copy()
     rigid[:3, :3] /= scale
     return replace(cloud, means=cloud.means * scale, scales=cloud.scales * scale).transformed(rigid)

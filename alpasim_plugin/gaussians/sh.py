@@ -60,7 +60,7 @@ def sh_basis(directions: npt.ArrayLike, size: int = 16) -> F64:
         >>> sh_basis([0.0, 0.0, 1.0], 4).round(4).tolist()
         [0.2821, -0.0, 0.4886, -0.0]
     """
-    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
     terms = (np.full_like(x, C0), *sh_terms(x, y, z))
     return np.stack(terms[:size], axis=-1)
 
@@ -75,7 +75,7 @@ def sh_colours(sh: FloatArray, directions: npt.ArrayLike) -> F64:
 
 def dc_from_rgb(rgb: npt.ArrayLike) -> F64:
     """Return the constant coefficients that show a colour from every side."""
-    return (np.asarray(rgb, np.float64) - 0.5) / C0
+    return (np.asarray(rgb, dtype=np.float64) - 0.5) / C0
 
 
 @lru_cache(maxsize=1)

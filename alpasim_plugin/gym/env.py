@@ -68,7 +68,7 @@ class Controls:
 
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Hold the command, and return where it leads in two seconds."""
-        steer, pedal = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        steer, pedal = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
         command = self.controller.commands[observation.t_us] = Command(
             float(steer) * self._vehicle.max_steer_rad,
             float(max(pedal, 0.0) * self._vehicle.max_accel_mps2),
@@ -124,7 +124,7 @@ class Trajectories:
 
     def plan(self, action: F64, observation: Observation) -> Plan:
         """Return the action as a plan, which begins at the ego."""
-        rows = np.vstack([np.zeros(3), np.asarray(action, np.float64)])
+        rows = np.vstack([np.zeros(3), np.asarray(action, dtype=np.float64)])
         return Plan(observation.t_us, observation.t_us + self._after_us, rows[:, :2], rows[:, 2])
 
 
@@ -343,7 +343,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         observation = self.observation
         speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
         finite = np.isfinite(observation.route_rig).all(axis=1)
-        out = np.zeros((ROUTE_POINTS, 3), np.float32)
+        out = np.zeros((ROUTE_POINTS, 3), dtype=np.float32)
         out[finite, :2] = np.clip(observation.route_rig[finite, :2], -ROUTE_M, ROUTE_M)
         out[finite, 2] = 1.0
         values = {"speed": speed.astype(np.float32), "route": out}

@@ -109,7 +109,7 @@ class Scorer:
         """
         scenario = self._scenario
         to_box = T_rig_box(scenario.vehicle)
-        times = np.array([ego.t_us for ego, _ in window], np.int64)
+        times = np.array([ego.t_us for ego, _ in window], dtype=np.int64)
         ego = trajectory_from_poses(
             times, np.array([one.T_world_rig @ to_box for one, _ in window])
         )

@@ -54,7 +54,7 @@ def coverage_of(cloud: GaussianCloud, path: F64) -> Coverage:
         cloud: In world coordinates.
         path: ``(N, 3)`` metres, world: the recorded drive.
     """
-    points = np.asarray(cloud.means[cloud.opacities > VISIBLE], np.float64)
+    points = np.asarray(cloud.means[cloud.opacities > VISIBLE], dtype=np.float64)
     if not len(points):
         return Coverage(np.full(3, np.nan), np.full(3, np.nan), 0.0)
     low, high = np.percentile(points, BULK, axis=0)

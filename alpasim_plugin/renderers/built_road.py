@@ -56,7 +56,7 @@ class BuiltRoad:
         T_world_camera = request.T_world_camera[1]
         place = T_world_camera[:3, 3]
         if place[2] < height_at(self.ground, place[None])[0] + ABOVE_M:
-            return np.zeros((0, 2), np.int64)
+            return np.zeros((0, 2), dtype=np.int64)
         local = (self.points - place) @ T_world_camera[:3, :3]
         local = local[(local[:, 2] > NEAREST_M) & (local[:, 2] < FARTHEST_M)]
         local = local[np.argsort(local[:, 2], kind="stable")]

@@ -24,7 +24,7 @@ from alpasim_plugin.streets.builder import build_scene
 from alpasim_plugin.world.ground import height_at
 
 CACHED_SCENES = 4
-ALL = np.ones((1, 1), np.float32)
+ALL = np.ones((1, 1), dtype=np.float32)
 
 T = TypeVar("T")
 _cache: OrderedDict[str, object] = OrderedDict()

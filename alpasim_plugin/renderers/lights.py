@@ -89,7 +89,7 @@ class SceneLights:
         """Return the light ``(H, W)``, lux, that street lamps and the ego's beams throw on what a
         camera sees.
         """
-        total = np.zeros(view.ground.shape, np.float32)
+        total = np.zeros(view.ground.shape, dtype=np.float32)
         is_surface = np.isfinite(view.distance_m)
         points = view.points[is_surface]
         beam = view.place - _moved(T_world_rig, self.ego_front_m, LAMP_HEIGHT_M)[:3, 3]
@@ -154,8 +154,8 @@ def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
     Returns:
         Their colours ``(H, W, 3)``, and their depths ``(H, W)``, infinite where there is none.
     """
-    light = np.zeros(view.rays.shape, np.float32)
-    front = np.full(view.depth_m.shape, np.inf, np.float32)
+    light = np.zeros(view.rays.shape, dtype=np.float32)
+    front = np.full(view.depth_m.shape, np.inf, dtype=np.float32)
     offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - view.place
     local = offsets @ view.T_world_camera[:3, :3]
     distance = np.linalg.norm(offsets, axis=1)

@@ -57,7 +57,7 @@ class Precipitation:
         per_mm = self.slope[0] * rate_mm_per_h ** self.slope[1]
         per_m3 = self.density[0] * rate_mm_per_h ** self.density[1] / per_mm * np.exp(-per_mm)
         area = shape[0] * shape[1] / (K[0, 0] * K[1, 1])  # of the view at 1 m
-        cover = np.zeros(shape, np.float32)
+        cover = np.zeros(shape, dtype=np.float32)
         for far_m, near_m in pairwise(SHELLS_M):
             px_per_m = K[1, 1] * 2 / (far_m + near_m)
             size_px = px_per_m * self.size_m

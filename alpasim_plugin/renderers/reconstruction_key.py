@@ -252,7 +252,7 @@ def write_model(
         ).reshape(-1, 2),
         K=np.array([v.camera.K for v in sky_views]).reshape(-1, 3, 3),
         T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
-        sky=np.concatenate(bits) if bits else np.zeros(0, np.uint8),
+        sky=np.concatenate(bits) if bits else np.zeros(0, dtype=np.uint8),
         name=np.array([view.name for view in sky_views], dtype=np.str_),
     )
 

@@ -175,7 +175,7 @@ def photograph_image(photograph: Photograph, camera: PinholeCamera) -> U8:
     rgb = read_image(Path(photograph.path))[..., ::-1]
     size = camera.width, camera.height
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(small, np.uint8)
+    return np.ascontiguousarray(small, dtype=np.uint8)
 
 
 def _read(

@@ -46,7 +46,7 @@ class SnowCover:
         local = (self.quads - view.place) @ view.T_world_camera[:3, :3]
         depth_m = local[..., 2]
         is_seen = (depth_m.max(axis=1) > NEAREST_M) & (depth_m.min(axis=1) < SIGHT_M)
-        cover: F32 = np.full(view.ground.shape, BESIDE, np.float32)
+        cover: F32 = np.full(view.ground.shape, BESIDE, dtype=np.float32)
         for quad, share in zip(local[is_seen], self.shares[is_seen].tolist(), strict=True):
             # It is cut at the plane `NEAREST_M` before the camera.
             following = np.roll(quad, -1, axis=0)

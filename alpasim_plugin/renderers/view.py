@@ -64,7 +64,7 @@ def view_of(
         boxes: Poses and sizes of road users.
     """
     height, width = depth.shape
-    local = np.ones((height, width, 3), np.float32)
+    local = np.ones((height, width, 3), dtype=np.float32)
     local[..., 0] = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
     local[..., 1] = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
     along = np.sqrt(np.einsum("...i,...i->...", local, local))
@@ -72,7 +72,7 @@ def view_of(
     _, labels = cv2.distanceTransformWithLabels(
         np.uint8(depth == 0), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    of_label = np.zeros(labels.max() + 1, np.float32)
+    of_label = np.zeros(labels.max() + 1, dtype=np.float32)
     of_label[labels[depth > 0]] = depth[depth > 0]
     filled = of_label[labels]  # each hole by the nearest pixel that has a surface
     is_sky = (filled == 0) | ((depth == 0) & (rays[..., 2] > 0))
@@ -87,7 +87,7 @@ def view_of(
     for pose, box in boxes:
         reach = BOX_M + np.array(box.size_m) / 2
         share[(np.abs((low - pose[:3, 3]) @ pose[:3, :3]) < reach).all(axis=1)] = 0
-    belongs = np.zeros(depth.shape, np.float32)
+    belongs = np.zeros(depth.shape, dtype=np.float32)
     belongs[is_low] = share
     points[is_low, 2] -= share * above_m
     return View(K, T_world_camera, rays, depth_m, distance_m, belongs, points)

@@ -39,7 +39,7 @@ LIGHT_RGB = {
     "low_sun": (1.0, 0.76, 0.54),  # about 3500 K
     "night": tuple(share * SKY_LUX / WHITE_LUX for share in (0.8, 0.9, 1.25)),
 }
-LAMP_RGB = np.array([1.0, 0.88, 0.7], np.float32)
+LAMP_RGB = np.array([1.0, 0.88, 0.7], dtype=np.float32)
 SUN_TANGENT = 0.1  # of its height
 # Veiling light of a lens about the sun, in white times square degrees, about a tenth of what Stiles
 # and Holladay found for the eye (CIE 146).
@@ -84,7 +84,7 @@ class WeatherRenderer(Renderer):
         self.has_history = base.has_history
         self.is_clear = scenario.environment == scenario.environment.in_clear_day
         self.lights = SceneLights(scenario)
-        self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], np.float32)
+        self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], dtype=np.float32)
         self.air_rgb = DAY_AIR_RGB * self.light_rgb
         rates = ((RAIN, scenario.environment.rain), (SNOW, scenario.environment.snow))
         self.falling = [(kind, rate) for kind, rate in rates if rate]

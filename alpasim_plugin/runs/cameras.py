@@ -84,7 +84,7 @@ def make_cadence(
         return Cadence(
             np.array(
                 [tick.t_us for tick in clock.ticks() if tick.policy_due and not tick.is_last],
-                np.int64,
+                dtype=np.int64,
             )
         )
     first = block.first

@@ -169,7 +169,10 @@ def raster_rate(device: str) -> Facts:
 
     def draws() -> Call:
         cloud, camera = transparent_splats(*LARGE)
-        clouds, behind = UploadedClouds([cloud], device), upload(np.zeros(3, np.float32), device)
+        clouds, behind = (
+            UploadedClouds([cloud], device),
+            upload(np.zeros(3, dtype=np.float32), device),
+        )
         return lambda: clouds.draw([(camera, [DrawnCloud(0)])], behind)[0].arrays
 
     return _rated(device, {"splats": draws})

@@ -66,7 +66,7 @@ def transparent_splats(width: int, height: int) -> tuple[GaussianCloud, PinholeC
         np.tile([1.0, 0, 0, 0], (SPLATS, 1)),
         np.full((SPLATS, 3), px_m),
         np.full(SPLATS, OPACITY),
-        np.zeros((SPLATS, 16, 3), np.float32),
+        np.zeros((SPLATS, 16, 3), dtype=np.float32),
     )
     K = np.diag([DISTANCE_M * width, DISTANCE_M * width, 1])
     return cloud, PinholeCamera(width, height, K, np.eye(4))

@@ -132,7 +132,7 @@ class LoopState:
         state = cls(
             scenario,
             ego_state_from_log(log, scenario.start_us, scenario.vehicle),
-            np.concatenate([log.t_us[:context], np.zeros(size - context, np.int64)]),
+            np.concatenate([log.t_us[:context], np.zeros(size - context, dtype=np.int64)]),
             np.concatenate([log.xyz[:context], np.zeros((size - context, 3))]),
             np.concatenate([log.quat[:context], np.zeros((size - context, 4))]),
             context,
@@ -287,7 +287,9 @@ class Forecast:
             past = self.history
             poses = np.stack([state.T_world_rig for state in states])
             self.history = Trajectory(
-                np.concatenate([past.t_us, np.array([state.t_us for state in states], np.int64)]),
+                np.concatenate(
+                    [past.t_us, np.array([state.t_us for state in states], dtype=np.int64)]
+                ),
                 np.concatenate([past.xyz, poses[:, :3, 3]]),
                 np.concatenate([past.quat, quat_from_matrix(poses[:, :3, :3])]),
             )

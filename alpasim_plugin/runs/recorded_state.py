@@ -28,7 +28,7 @@ def ego_states_from_log(
     Raises:
         InputError: A time lies outside the log.
     """
-    t = np.asarray(t_us, np.int64)
+    t = np.asarray(t_us, dtype=np.int64)
     before = np.maximum(t - DIFFERENCE_US, ego_log.t_us[0])
     after = np.minimum(t + DIFFERENCE_US, ego_log.t_us[-1])
     poses = interpolate(ego_log, np.stack([before, t, after], axis=-1))  # (N, 3, 4, 4)

@@ -49,7 +49,7 @@ from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.film import Film
 from alpasim_plugin.runs.recorded_state import ego_states_from_log
 
-NO_PLAN = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+NO_PLAN = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 
 
 class StageTimes:

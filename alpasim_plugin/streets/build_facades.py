@@ -173,7 +173,7 @@ def _claim(free: U8, ring: F64, site: Site) -> bool:
     h, w = free.shape
     if x0 < 0 or y0 < 0 or x1 > w or y1 > h:
         return False
-    mask = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    mask = np.zeros((y1 - y0, x1 - x0), dtype=np.uint8)
     shifted = inner - np.array([x0, y0]) * (1 << SHIFT_BITS)
     cv2.fillConvexPoly(mask, shifted.astype(np.int32), 1, cv2.LINE_8, SHIFT_BITS)
     part = free[y0:y1, x0:x1]
@@ -267,7 +267,7 @@ def _roofs(
     b = houses.front[:, 1]
     length = np.linalg.norm(b - a, axis=1)
     n_u = cell_counts(length, 2 * cell_m)
-    n_v = np.full(len(a), max(1, round(DEPTH_M / cell_m / 2)), np.int64)
+    n_v = np.full(len(a), max(1, round(DEPTH_M / cell_m / 2)), dtype=np.int64)
     house, u, v = grid_cells(n_u, n_v)
     plan = a[house] + u[:, None] * (b - a)[house] + v[:, None] * DEPTH_M * houses.away[house]
     xy = site.frame.to_world(plan)

@@ -105,11 +105,11 @@ def paint_ground(
     tag = f"ground-{cell_m}"
     grain = _noise(site, tag, (rows, columns), cell_m)
 
-    rgb = np.empty((rows, columns, 3), np.float32)
+    rgb = np.empty((rows, columns, 3), dtype=np.float32)
     verge = ~road
     rgb[verge] = _verge(site, off[verge], grain[verge], texture)
     tone = 1 + texture * (0.10 * grain - _wear(site, low, cell_m, (rows, columns)))
-    rgb[road] = np.array(ASPHALT, np.float32) * tone[road][:, None]
+    rgb[road] = np.array(ASPHALT, dtype=np.float32) * tone[road][:, None]
     # Cells half covered by a thin line would alias along the crisp strokes laid over them.
     thinnest = 0.3 if cell_m < CELL_M else 0.0
     covers = [
@@ -119,9 +119,9 @@ def paint_ground(
     for colour, cover in zip((WHITE, YELLOW), covers, strict=True):
         on = cover > 0
         worn = cover[on] * (0.95 - 0.12 * texture * np.clip(grain[on], 0, 2))
-        rgb[on] += worn[:, None] * (np.array(MARKING_IMAGE_RGB[colour], np.float32) - rgb[on])
+        rgb[on] += worn[:, None] * (np.array(MARKING_IMAGE_RGB[colour], dtype=np.float32) - rgb[on])
 
-    marked = np.zeros((rows, columns), bool)
+    marked = np.zeros((rows, columns), dtype=bool)
     for colour in (WHITE, YELLOW):
         marked |= _coverage(strokes, colour, low, cell_m, (rows, columns)) > 0.04
     near_marking = distance_m(marked, cell_m)
@@ -157,7 +157,7 @@ def _noise(site: Site, tag: str, shape: tuple[int, int], cell_m: float) -> F32:
     """Return smooth noise ``(H, W)`` of about unit spread: octaves from the grain of asphalt to
     patches of ten metres.
     """
-    total = np.zeros(shape, np.float32)
+    total = np.zeros(shape, dtype=np.float32)
     rng = site.rng(tag)
     for grid_m, weight in ((0.13, 0.6), (0.4, 0.45), (1.2, 0.4), (3.0, 0.4), (12.0, 0.45)):
         step = max(grid_m, cell_m)
@@ -192,7 +192,7 @@ def _wear(site: Site, low: F64, cell_m: float, shape: tuple[int, int]) -> F32:
     """Return what darkens asphalt, 0..1: wheel tracks and the oil line of each lane, patches and
     cracks near the path.
     """
-    dark = np.zeros(shape, np.uint8)
+    dark = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     for lane in site.scenario.lane_map.lanes.values():
         if lane.kind not in ("vehicle", "bus") or lane.is_intersection or len(lane.centre) < 2:
@@ -262,7 +262,7 @@ def _coverage(
     """Return the share ``(H, W)`` of each cell under markings of one colour; strokes thinner than
     ``thinnest_m`` are left out.
     """
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros(shape, dtype=np.uint8)
     high = low + np.array(shape[::-1]) * cell_m
     near = np.all((strokes.start > low - 5) & (strokes.start < high + 5), axis=1)
     chosen = near & (strokes.colour == colour) & (strokes.width_m >= thinnest_m)
@@ -307,7 +307,7 @@ def build_road(site: Site, strokes: Strokes) -> list[SceneNode]:
     n = round(TILE_M / 0.25)
     h = -(-d.shape[0] // n)
     w = -(-d.shape[1] // n)
-    padded = np.full((h * n, w * n), np.inf, np.float32)
+    padded = np.full((h * n, w * n), np.inf, dtype=np.float32)
     padded[: d.shape[0], : d.shape[1]] = d
     fine_tiles = padded.reshape(h, n, w, n).min(axis=(1, 3)) < CORRIDOR_M
     # The fine tiles in cells of the image.

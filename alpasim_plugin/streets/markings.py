@@ -56,7 +56,7 @@ def marking_strokes(site: Site) -> Strokes:
             pieces.append(_strokes(line[:-1], line[1:], STOP_LINE_M, WHITE))
     pieces = [p for p in pieces if len(p.start)]
     if not pieces:
-        return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+        return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
     joined = Strokes(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
     inside = np.all((joined.start > site.low) & (joined.start < high), axis=1)
     return Strokes._make(column[inside] for column in joined)

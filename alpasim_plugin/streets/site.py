@@ -57,7 +57,7 @@ class GroundFrame:
         """Map world points ``(N, 2+)`` to ground coordinates ``(N, 2)``."""
         c = np.cos(self.yaw_rad)
         s = np.sin(self.yaw_rad)
-        d = np.asarray(xy, np.float64)[:, :2] - self.origin_xy
+        d = np.asarray(xy, dtype=np.float64)[:, :2] - self.origin_xy
         return np.column_stack([c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1]])
 
     def to_world(self, plan: F64) -> F64:
@@ -134,7 +134,7 @@ class Site:
     @cached_property
     def path_m(self) -> F32:
         """Return ``(H, W)`` the distance of each cell to the path."""
-        mask = np.zeros(self.road.shape, np.uint8)
+        mask = np.zeros(self.road.shape, dtype=np.uint8)
         cv2.polylines(mask, [self.pixels(self.path)], False, 1, 1, cv2.LINE_8, SHIFT_BITS)
         return distance_m(mask.astype(bool))
 
@@ -177,7 +177,7 @@ def distance_m(mask: Bool, cell_m: float = CELL_M) -> F32:
     none.
     """
     if not mask.any():
-        return np.full(mask.shape, 1.0e3, np.float32)
+        return np.full(mask.shape, 1.0e3, dtype=np.float32)
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) * np.float32(cell_m)
 
 
@@ -209,7 +209,7 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
         plan = frame.to_ground(lane.centre)
         if np.all(plan.max(axis=0) > low) and np.all(plan.min(axis=0) < high):
             near.append(lane)
-    road = np.zeros(shape, np.uint8)
+    road = np.zeros(shape, dtype=np.uint8)
     for ring in (*_lane_rings(near), *scenario.lane_map.drivable_areas):
         if len(ring) >= 3:
             corners = to_pixels(frame.to_ground(ring), low, CELL_M)
@@ -223,7 +223,7 @@ def make_site(scenario: Scenario, height_at: HeightAt, section: int | None = Non
     )
     # A soft edge instead of the raster's staircase: kerbs and grass follow the half-way line.
     road = (cv2.GaussianBlur(road.astype(np.float32), (0, 0), 1.5) > 0.5).astype(np.uint8)
-    mask = np.zeros(shape, np.uint8)
+    mask = np.zeros(shape, dtype=np.uint8)
     for actor in scenario.actors:
         radius = 0.5 * np.hypot(actor.box.length_m, actor.box.width_m) + 0.5
         points = to_pixels(frame.to_ground(actor.track.xyz), low, CELL_M)
@@ -241,7 +241,7 @@ def _owned_tiles(path: F64, low: F64, high: F64, section: int | None) -> Bool:
     """Return which tiles ``(Ty, Tx)`` of a site, and around it to the horizon, a section owns."""
     count = np.ceil((high - low + 2 * HORIZON_M) / TILE_M).astype(np.int64)
     if section is None:
-        return np.ones(count[::-1], bool)
+        return np.ones(count[::-1], dtype=bool)
     grid = np.stack(np.meshgrid(np.arange(count[0]), np.arange(count[1])), axis=-1)
     _, nearest = scipy.spatial.KDTree(path).query(low - HORIZON_M + (grid + 0.5) * TILE_M)
     return section_of(nearest) == section

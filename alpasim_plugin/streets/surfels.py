@@ -38,14 +38,14 @@ def cloud_of(
         rgb: ``(N, 3)`` 0..1.
         opacity: ``(N,)``.
     """
-    centres = np.asarray(means, np.float64)
+    centres = np.asarray(means, dtype=np.float64)
     n = len(centres)
     colours = np.clip(np.broadcast_to(rgb, (n, 3)), 0.0, 1.0)
     return GaussianCloud(
         centres,
-        np.array(np.broadcast_to(quats, (n, 4)), np.float32),
-        np.array(np.broadcast_to(scales, (n, 3)), np.float32),
-        np.array(np.broadcast_to(opacity, (n,)), np.float32),
+        np.array(np.broadcast_to(quats, (n, 4)), dtype=np.float32),
+        np.array(np.broadcast_to(scales, (n, 3)), dtype=np.float32),
+        np.array(np.broadcast_to(opacity, (n,)), dtype=np.float32),
         dc_from_rgb(colours)[:, None, :].astype(np.float32),
     )
 
@@ -66,7 +66,7 @@ def with_sheen(
         sky_rgb: Colour that is mirrored.
     """
     add = np.outer(strength, sky_rgb)  # (N, 3)
-    sh = np.zeros((len(cloud), 4, 3), np.float32)
+    sh = np.zeros((len(cloud), 4, 3), dtype=np.float32)
     sh[:, 0] = cloud.sh[:, 0] + dc_from_rgb(0.5 + add)
     for k, axis, sign in ((1, 1, -1.0), (2, 2, 1.0), (3, 0, -1.0)):
         sh[:, k] = sign * normals[:, axis, None] * add / C1

@@ -169,7 +169,7 @@ def find_leader(
     """Return the leader of one driver on the only line of ``line``; see `find_leaders`."""
     driver = (np.array([front_s_m]), np.array([half_width_m]))
     nobody = np.array([-1])
-    zero = np.zeros(1, np.int64)
+    zero = np.zeros(1, dtype=np.int64)
     return find_leaders(line, zero, *driver, bodies, np.array([horizon_m]), nobody, margin_m)[0]
 
 

@@ -43,7 +43,7 @@ class _Edges:
             for edge in _edges_of(lane_map)
             if len(edge.line) > 1 and arc_lengths(edge.line)[-1] > SHORTEST_M
         ]
-        owner = [np.zeros(0, np.int64)]
+        owner = [np.zeros(0, dtype=np.int64)]
         points = [np.zeros((0, 2))]
         headings = [np.zeros((0, 2))]
         for i, edge in enumerate(self.all):

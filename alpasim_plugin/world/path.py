@@ -209,7 +209,7 @@ class Lines:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        counts = np.array([len(path.s) for path in paths], np.int64)
+        counts = np.array([len(path.s) for path in paths], dtype=np.int64)
         self.end = np.cumsum(counts)
         self.begin = self.end - counts
         self.length_m = np.array([path.length_m for path in paths])
@@ -290,7 +290,7 @@ def polyline_path(xyz: F64) -> Path:
     Raises:
         InputError: Fewer than two distinct points.
     """
-    line = np.asarray(xyz, np.float64)
+    line = np.asarray(xyz, dtype=np.float64)
     if line.shape[1] == 2:
         line = np.column_stack([line, np.zeros(len(line))])
     line = line[np.concatenate([[True], step_lengths(line) > 1e-4])]

@@ -82,7 +82,7 @@ class LaneIndex:
         if not self._kd:
             return ()
         hits = self._kd[len(point)].query_ball_point(point, radius_m)
-        return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, np.int64)]))
+        return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, dtype=np.int64)]))
 
     def heading_rad(self, lane_id: str, point: F64) -> float:
         """Return the driving direction of a lane at the place nearest to the point, in plan

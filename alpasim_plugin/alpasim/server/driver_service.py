@@ -193,7 +193,7 @@ class Driving:
         self._lock = threading.Lock()
         self._images: dict[str, tuple[int, bytes]] = {}  # end of the exposure, encoded
         self._sizes: dict[str, tuple[int, int]] = {}
-        self._history = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+        self._history = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
         self._state: Any = None
         self._route_rig: F64 = np.full((ROUTE_POINTS, 3), np.nan)
         self._policy: Policy | None = None
@@ -459,5 +459,7 @@ class _Serving(DriverService):
 
 
 def _unknown_scene(scene_id: str) -> Scenario:
-    standing = Trajectory(np.zeros(1, np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    standing = Trajectory(
+        np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
+    )
     return blank_scenario(scene_id, standing)

@@ -167,7 +167,7 @@ def top_hat(rgb: U8) -> U8:
     """
     side = max(5, int(rgb.shape[1] * MARKING_SHARE) | 1)
     bright = np.ascontiguousarray(rgb[..., :2].max(axis=2))  # white and yellow markings alike
-    return cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), np.uint8))
+    return cv2.morphologyEx(bright, cv2.MORPH_TOPHAT, np.ones((1, side), dtype=np.uint8))
 
 
 def pieces_of(lines: Bool) -> Pieces:
@@ -210,7 +210,7 @@ def agreement(pieces: Pieces, markings: U8) -> float | None:
 def _brightest(markings: U8, row: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the largest value of each run."""
     if not len(row):
-        return np.zeros(0, np.uint8)
+        return np.zeros(0, dtype=np.uint8)
     flat = np.append(markings.ravel(), np.uint8(0))  # so that a run may end with the image
     places = np.stack(
         [row * markings.shape[1] + first, row * markings.shape[1] + end], axis=1

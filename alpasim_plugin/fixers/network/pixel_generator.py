@@ -138,7 +138,7 @@ def pixel_noise(key: int, pixels: I64) -> F32:
     values = pixels[:, None] * CHANNELS + np.arange(CHANNELS)
     u, v = ((_mixed(counters) + 1) * 2.0**-53 for counters in _counters(key, values))
     normal = np.sqrt(-2 * np.log(u)) * np.cos(2 * np.pi * v)  # Box and Muller, 1958
-    return np.asarray(normal, np.float32)
+    return np.asarray(normal, dtype=np.float32)
 
 
 def content_key(t_us: int, rgb: U8) -> int:

@@ -68,8 +68,8 @@ def draw_map(
     view, pose, faces, edges = seen_from(scene, camera, T_world_camera, actors)
     lines, box_edges = (strokes_of(part, pose, view) for part in (scene.segments, edges))
     shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
-    image: U8 = np.empty((rows.stop, camera.width, 3), np.uint8)
-    band = np.full(1, rows.start // BAND, np.int64)
+    image: U8 = np.empty((rows.stop, camera.width, 3), dtype=np.uint8)
+    band = np.full(1, rows.start // BAND, dtype=np.int64)
     stretch = camera.width / camera.height
     run_on_threads(
         thread_count(threads), draw_bands, band, lines, box_edges, shapes, stretch, image
@@ -132,16 +132,16 @@ def seen_from(
     """Return the view as `kernels` reads it, the pose ``(3, 4)`` that maps the scene's own
     coordinates into the camera's, and the faces and edges of road users.
     """
-    K = np.asarray(camera.K, np.float64)
+    K = np.asarray(camera.K, dtype=np.float64)
     intrinsics = (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2])
     view = (*intrinsics, camera.width, camera.height, camera.width / WIDTH_DEFINED_AT_PX)
-    T = np.array(T_world_camera, np.float64)
+    T = np.array(T_world_camera, dtype=np.float64)
     T[:3, 3] -= scene.origin  # the difference of large coordinates is taken here, once, in float64
     pose = np.ascontiguousarray(inverse(T)[:3])
     # The faces of road users, the nearest first, so that hidden ones are not shaded. Boxes cut by
     # the near plane show their inner faces; of others, faces turned away are culled.
-    poses = np.array([actor.T_world_box for actor in actors], np.float64).reshape(-1, 4, 4)
-    sizes = np.array([actor.box.size_m for actor in actors], np.float64).reshape(-1, 1, 3)
+    poses = np.array([actor.T_world_box for actor in actors], dtype=np.float64).reshape(-1, 4, 4)
+    sizes = np.array([actor.box.size_m for actor in actors], dtype=np.float64).reshape(-1, 1, 3)
     centres = poses[:, :3, 3] - scene.origin
     order = np.argsort(centres @ pose[2, :3], kind="stable")
     rotated = (CORNERS * sizes) @ poses[:, :3, :3].transpose(0, 2, 1)

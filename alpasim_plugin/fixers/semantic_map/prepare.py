@@ -155,7 +155,7 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     style = np.empty((len(triangles), 7))
     style[: len(on_ground)] = (CROSSWALK_BIAS_M, *COLOURS["crosswalk"], *COLOURS["crosswalk"])
     style[len(on_ground) :] = (0.0, *COLOURS["sign"], *COLOURS["sign"])
-    is_closed = np.zeros(len(triangles), bool)
+    is_closed = np.zeros(len(triangles), dtype=bool)
     filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
     return PreparedMap(origin, _segments(pieces), filled)
 

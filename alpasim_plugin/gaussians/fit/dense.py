@@ -66,7 +66,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
             if 0 <= i + gap < len(views) and views[i + gap].camera.width == view.camera.width
         ]
         if guess is None or len(near) < 2:
-            out.append(np.zeros(view.rgb.shape[:2], np.float32))
+            out.append(np.zeros(view.rgb.shape[:2], dtype=np.float32))
             continue
         neighbours = [
             _NeighbourFlow.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
@@ -163,8 +163,8 @@ class _NeighbourFlow:
         p = self.a + q[..., None] * self.b
         z = np.maximum(p[..., 2:], 1e-3)
         uv = p[..., :2] / z
-        return np.asarray(uv - self.uv, np.float32), np.asarray(
-            (self.b[:2] - uv * self.b[2]) / z, np.float32
+        return np.asarray(uv - self.uv, dtype=np.float32), np.asarray(
+            (self.b[:2] - uv * self.b[2]) / z, dtype=np.float32
         )
 
 
@@ -172,7 +172,7 @@ def _depth(view: PosedView, neighbours: Sequence[_NeighbourFlow], guess: F32) ->
     """Find each measured pixel's inverse depth from where the neighbours see it, and how far they agree."""
     q = guess[::STRIDE, ::STRIDE].copy()
     for _ in range(ROUNDS):
-        H = np.full(q.shape, 1e-9, np.float32)
+        H = np.full(q.shape, 1e-9, dtype=np.float32)
         g = np.zeros_like(q)
         for other in neighbours:
             e, J = other.error(q)
@@ -180,7 +180,7 @@ def _depth(view: PosedView, neighbours: Sequence[_NeighbourFlow], guess: F32) ->
             H += weight * (J * J).sum(axis=2)
             g += weight * (J * e).sum(axis=2)
         q = np.clip(q - g / H, 0.0, 1 / NEAR_M).astype(np.float32)
-    support = np.zeros(q.shape, np.int32)
+    support = np.zeros(q.shape, dtype=np.int32)
     information = np.zeros_like(q)
     for other in neighbours:
         e, J = other.error(q)
@@ -195,10 +195,12 @@ def _depth(view: PosedView, neighbours: Sequence[_NeighbourFlow], guess: F32) ->
     )
     grey = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     step = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
-    confident &= (cv2.dilate(step, np.ones((5, 5), np.uint8)) > LEAST_STEP)[::STRIDE, ::STRIDE]
+    confident &= (cv2.dilate(step, np.ones((5, 5), dtype=np.uint8)) > LEAST_STEP)[
+        ::STRIDE, ::STRIDE
+    ]
     if view.mask is not None:
         confident &= view.mask[::STRIDE, ::STRIDE]
-    depth = np.zeros(view.rgb.shape[:2], np.float32)
+    depth = np.zeros(view.rgb.shape[:2], dtype=np.float32)
     depth[::STRIDE, ::STRIDE] = np.where(confident, 1 / np.maximum(q, 1e-6), 0)
     return depth
 
@@ -213,8 +215,8 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
     camera = views[i].camera
     z = depth[rows, columns].astype(np.float64)
     local = camera.unprojected(rows, columns, z)
-    confirmed = np.zeros(len(z), bool)
-    covered = np.zeros(len(z), bool)
+    confirmed = np.zeros(len(z), dtype=bool)
+    covered = np.zeros(len(z), dtype=bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
             other = views[i + gap].camera
@@ -233,7 +235,7 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
                 np.abs(neighbour_depth - p[:, 2]) < AGREE * p[:, 2]
             )
             covered |= neighbour_depth > 0
-    keep = np.zeros(depth.shape, bool)
+    keep = np.zeros(depth.shape, dtype=bool)
     keep[rows, columns] = confirmed | ~covered
     return np.where(keep, depth, 0)
 
@@ -278,12 +280,12 @@ def _regions(view: PosedView) -> I32:
     if view.mask is not None:
         smooth &= view.mask
     _, label = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
-    out = np.zeros(grey.shape, np.int32)
+    out = np.zeros(grey.shape, dtype=np.int32)
     measured = None if view.depth is None else view.depth > 0
     for i in set(np.unique(label[0])) - {0}:
         region = label == i
         # Flow spreads depth over the edges of trees into the sky: the inside of a region decides.
-        inside = cv2.erode(region.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        inside = cv2.erode(region.astype(np.uint8), np.ones((9, 9), dtype=np.uint8)) > 0
         solid = (
             0.0
             if measured is None or not inside.any()
@@ -298,11 +300,11 @@ def _of_colour(view: PosedView, label: I32, usual: F32) -> Bool:
     """Keep regions whose usual colour is that of the sky; a sky grows brighter towards the horizon,
     so single pixels may differ more.
     """
-    out = np.zeros(label.shape, np.uint8)
+    out = np.zeros(label.shape, dtype=np.uint8)
     for i in set(np.unique(label)) - {0}:
         middle = np.median(view.rgb[label == i].astype(np.float32), axis=0)
         if np.abs(middle - usual).max() < COLOUR_LEVELS:
             out |= (
                 (label == i) & (np.abs(view.rgb - middle).max(axis=2) < 1.5 * COLOUR_LEVELS)
             ).astype(np.uint8)
-    return cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    return cv2.morphologyEx(out, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8)) > 0

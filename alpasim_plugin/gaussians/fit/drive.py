@@ -138,7 +138,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
     tracks = (
         follow(views)
         if len({view.rgb.shape for view in views}) == 1
-        else Tracks(*(np.zeros(0, np.int64),) * 2, np.zeros((0, 2)), 0)
+        else Tracks(*(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 2)), 0)
     )
     placed = place(tracks, [view.camera for view in views])
     maps = depth_maps(views, tracks, placed)
@@ -163,7 +163,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         red, green, blue = gain.tolist()
         done.append(replace(view, sky=sky, depth=depth, gain=(red, green, blue)))
         q = between_points(view.camera, tracks, placed, i)
-        guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), np.float32))
+        guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), dtype=np.float32))
     return done, guesses
 
 
@@ -194,7 +194,9 @@ def _start(
     for view, guess in zip(views, guesses, strict=True):
         assert view.depth is not None
         near = (
-            cv2.dilate((view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, np.uint8))
+            cv2.dilate(
+                (view.depth > 0).astype(np.uint8), np.ones((2 * STRIDE + 1,) * 2, dtype=np.uint8)
+            )
             > 0
         )
         free = ~near & (True if view.sky is None else ~view.sky)

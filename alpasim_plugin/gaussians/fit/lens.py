@@ -167,10 +167,10 @@ def gain_near(camera: str, place: F64, cameras: Sequence[str], centres: F64, gai
         centres: ``(N, 3)`` metres, world: where they were taken.
         gains: ``(N, 3)`` of their red, green and blue.
     """
-    centres = np.asarray(centres, np.float64).reshape(-1, 3)
-    gains = np.asarray(gains, np.float64).reshape(-1, 3)
+    centres = np.asarray(centres, dtype=np.float64).reshape(-1, 3)
+    gains = np.asarray(gains, dtype=np.float64).reshape(-1, 3)
     if not len(centres):
-        return np.ones(3, np.float32)
+        return np.ones(3, dtype=np.float32)
     is_own = np.array([name == camera for name in cameras])
     if is_own.any():
         centres = centres[is_own]
@@ -178,7 +178,7 @@ def gain_near(camera: str, place: F64, cameras: Sequence[str], centres: F64, gai
     distance = np.linalg.norm(centres - place, axis=1)
     nearest = np.argsort(distance, kind="stable")[:2]
     weight = 1 / (distance[nearest] + 1e-3)
-    return np.asarray(weight @ gains[nearest] / weight.sum(), np.float32)
+    return np.asarray(weight @ gains[nearest] / weight.sum(), dtype=np.float32)
 
 
 def _patch(rgb: U8, pixel: F64) -> F64:

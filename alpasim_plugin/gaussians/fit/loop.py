@@ -97,7 +97,7 @@ def fit(
     background, actors = run.model.clouds()
     gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
     return Reconstruction(
-        background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)), gains
+        background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)), gains
     )
 
 

@@ -103,7 +103,7 @@ class SplatModel:
         """Turn a view's actor poses ``T_world_box`` into tensors."""
         m = len(self.actors) + 1
         size = 1 + self.params["sh_rest"].shape[1]
-        present = np.zeros(m, bool)
+        present = np.zeros(m, dtype=bool)
         T = np.tile(np.eye(4), (m, 1, 1))
         quat = np.tile(np.eye(4), (m, 1, 1))
         harmonics = np.tile(np.eye(size), (m, 1, 1))

@@ -142,7 +142,9 @@ class PosedPhotograph:
         """
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
         bgr = decode_image(self.encoded(), f"{self.location}, {self.file}", WHOLE, flags)
-        return np.ascontiguousarray(self.lens.straightened(np.asarray(bgr, np.uint8)[..., ::-1]))
+        return np.ascontiguousarray(
+            self.lens.straightened(np.asarray(bgr, dtype=np.uint8)[..., ::-1])
+        )
 
     def view(self) -> PosedView:
         """Return it as a view at full size."""
@@ -261,7 +263,7 @@ def resized(view: PosedView, width: int) -> PosedView:
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
     return PosedView(
         PinholeCamera(width, height, K, camera.T_camera_world),
-        np.asarray(rgb, np.uint8),
+        np.asarray(rgb, dtype=np.uint8),
         view.name,
     )
 
@@ -372,7 +374,7 @@ def rigid_pose(value: Any, location: str) -> F64:
         InputError: It is no finite matrix of 4 x 4 (or 3 x 4), or no rotation: scaled, sheared or
             left-handed.
     """
-    T = np.asarray(as_shape(list[list[float]], value, location), np.float64)
+    T = np.asarray(as_shape(list[list[float]], value, location), dtype=np.float64)
     if T.shape == (3, 4):
         T = np.vstack([T, [0.0, 0.0, 0.0, 1.0]])
     if T.shape != (4, 4) or not np.isfinite(T).all():

@@ -128,7 +128,7 @@ def sky_of(views: Sequence[PosedView]) -> Sky | None:
     for view in views:
         if view.sky is not None:
             rows, columns = np.nonzero(
-                cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
+                cv2.erode(view.sky.astype(np.uint8), np.ones((3, 3), dtype=np.uint8), borderValue=1)
             )
             camera = view.camera
             local = camera.unprojected(rows, columns, np.ones(len(rows)))
@@ -166,4 +166,4 @@ def _spread(image: F32, validity: F32) -> F32:
         np.where(area[..., None] > 0, mean, 0).astype(np.float32), (area > 0).astype(np.float32)
     )
     filled = cv2.resize(coarse, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.where(validity[..., None] > 0, image, filled), np.float32)
+    return np.asarray(np.where(validity[..., None] > 0, image, filled), dtype=np.float32)

@@ -81,7 +81,7 @@ def start_from_depth(
         points, rgb = _sample(
             view, DENSER * share, stream(scene_id, seed, f"fit.start.view.{view.name}")
         )
-        free = np.ones(len(points), bool)
+        free = np.ones(len(points), dtype=bool)
         for actor_id in sorted(set(view.actors) & set(boxes)):
             local = transform_points(inverse(view.actors[actor_id]), points)
             box = boxes[actor_id]

@@ -78,22 +78,26 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     """
     greys = [cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY) for view in views]
     rows = []
-    points = np.zeros((0, 2), np.float32)
-    ids = np.zeros(0, np.int64)
+    points = np.zeros((0, 2), dtype=np.float32)
+    ids = np.zeros(0, dtype=np.int64)
     count = 0
     for i, grey in enumerate(greys):
         mask = views[i].mask
-        free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
+        free = (
+            np.full(grey.shape, 255, dtype=np.uint8)
+            if mask is None
+            else mask.astype(np.uint8) * 255
+        )
         for x, y in np.rint(points).astype(int):
             cv2.circle(free, (int(x), int(y)), APART_PX, 0, -1)
         corners = cv2.goodFeaturesToTrack(
             grey, max(CORNERS - len(points), 1), QUALITY, APART_PX, mask=free
         )
-        fresh = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
+        fresh = np.zeros((0, 2), dtype=np.float32) if corners is None else corners.reshape(-1, 2)
         points = np.concatenate([points, fresh])
         ids = np.concatenate([ids, count + np.arange(len(fresh))])
         count += len(fresh)
-        rows.append((np.full(len(ids), i, np.int64), ids, points.astype(np.float64) + 0.5))
+        rows.append((np.full(len(ids), i, dtype=np.int64), ids, points.astype(np.float64) + 0.5))
         if i + 1 < len(views) and len(points):
             b = greys[i + 1]
             options = {"winSize": WINDOW, "maxLevel": 4}
@@ -114,7 +118,7 @@ def follow(views: Sequence[PosedView]) -> Tracks:
     view, point, pixel = (np.concatenate([row[k] for row in rows]) for k in range(3))
     order = np.argsort(point, kind="stable")
     all_ = Tracks(view[order], point[order], pixel[order], count)
-    return all_.only(np.ones(len(order), bool))
+    return all_.only(np.ones(len(order), dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +154,9 @@ def place(tracks: Tracks, cameras: Sequence[PinholeCamera]) -> Placed:
         summed(values, tracks.point, tracks.count)
         for values in (across, np.einsum("nij,nj->ni", across, centre[tracks.view]))
     )
-    xyz: F64 = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], np.float64)
+    xyz: F64 = np.asarray(
+        np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], dtype=np.float64
+    )
     for _ in range(ROUNDS):
         e, slope, _ = residuals(xyz, tracks, R, t, K)
         J = slope @ R[tracks.view]
@@ -306,7 +312,7 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     moved = t - np.einsum("nij,njk,nk->ni", R, R0.transpose(0, 2, 1), t0)
     pull_poses += prior * np.concatenate([turn, moved], axis=1)
     between = weighted_pose @ by_point  # (M, 6, 3)
-    inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), np.float64)
+    inverse: F64 = np.asarray(np.linalg.inv(of_points + 1e-6 * np.eye(3)), dtype=np.float64)
     # The normal equations of the poses alone.
     order = np.argsort(view, kind="stable")
     starts = np.searchsorted(view[order], np.arange(views + 1))
@@ -319,6 +325,6 @@ def _step(R: F64, t: F64, K: F64, R0: F64, t0: F64, tracks: Tracks, xyz: F64) ->
     for i in range(views):
         H[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += of_poses[i]
     g = pull_poses.ravel() - blocks @ (middle @ pull_points.ravel())
-    step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), np.float64)
+    step: F64 = np.asarray(-np.linalg.solve(H, g).reshape(views, 6), dtype=np.float64)
     back = summed(np.einsum("nij,ni->nj", between, step[view]), point, points)
-    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), np.float64)
+    return step, np.asarray(-np.einsum("nij,nj->ni", inverse, pull_points + back), dtype=np.float64)

@@ -133,7 +133,9 @@ def halved(view: PosedView) -> PosedView:
         return (
             None
             if flags is None
-            else np.asarray(flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), np.bool_)
+            else np.asarray(
+                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
+            )
         )
 
     depth = (

@@ -52,8 +52,8 @@ class RasterOutput:
             again: Draws the image with all parts once more, where a device lacked room for one;
                 alone in a list.
         """
-        rgb = np.zeros((height, width, 3), np.float32)
-        alpha = np.ones((height, width), np.float32)
+        rgb = np.zeros((height, width, 3), dtype=np.float32)
+        alpha = np.ones((height, width), dtype=np.float32)
         return RasterOutput(rgb, alpha, np.zeros_like(alpha))
 
     def beside(self, array: FloatArray | Bool) -> Any:
@@ -109,7 +109,7 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
     Raises:
         InputError: Neither three finite numbers nor an image of the camera's size.
     """
-    value = np.asarray(background, np.float32)
+    value = np.asarray(background, dtype=np.float32)
     if value.shape == (3,):
         value = value.reshape(1, 1, 3)
     elif value.shape != (camera.height, camera.width, 3):

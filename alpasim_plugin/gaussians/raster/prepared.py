@@ -65,7 +65,7 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     size = cloud.sh.shape[1]
     kept = cloud.take(index)
     opacity = kept.opacities.astype(np.float64)
-    geometry = np.zeros((n, GEO_SIZE), np.float32)
+    geometry = np.zeros((n, GEO_SIZE), dtype=np.float32)
     factor = kept.rotations() * kept.scales.astype(np.float64)[:, None, :]
     geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = factor.reshape(n, 9)
     geometry[:, GEO_PEAK] = (np.log2(opacity) + 4.0) / 8.0
@@ -79,7 +79,7 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
         _in_lanes(kept.means.astype(np.float64), np.nan),
         _in_lanes(geometry, 0.0),
         _in_lanes(kept.sh.reshape(n, size * 3).astype(np.float32), 0.0),
-        np.concatenate([index, np.zeros(-n % _LANES, np.int64)]).astype(np.int64),
+        np.concatenate([index, np.zeros(-n % _LANES, dtype=np.int64)]).astype(np.int64),
         cloud.antialias_px2,
     )
 
@@ -87,6 +87,6 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
 def _in_lanes(columns: FloatArray, fill: float) -> npt.NDArray[Any]:
     """Turn ``(N, C)`` into groups of C x 16 lanes, flat."""
     n, width = columns.shape
-    padded = np.full((n + (-n % _LANES), width), fill, columns.dtype)
+    padded = np.full((n + (-n % _LANES), width), fill, dtype=columns.dtype)
     padded[:n] = columns
     return np.ascontiguousarray(padded.reshape(-1, _LANES, width).transpose(0, 2, 1)).reshape(-1)

@@ -81,7 +81,9 @@ def rasterize_prepared(
     if camera.rolling is not None:
         still = camera.motion(_IDENTITY, _IDENTITY)
         for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
-            moves = None if T is None or T_start is None else (np.asarray(T, np.float64), T_start)
+            moves = (
+                None if T is None or T_start is None else (np.asarray(T, dtype=np.float64), T_start)
+            )
             pose[POSE_TURN:] = still if moves is None else camera.motion(*moves)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = [
@@ -89,10 +91,10 @@ def rasterize_prepared(
         for (prepared, _), end, pose in zip(nodes, ends, poses, strict=True)
     ]
     room = sum(len(prepared.index) for prepared, _ in nodes)
-    records = np.empty(room * RECORD, np.float32)
-    ids = np.empty(room, np.int64)
+    records = np.empty(room * RECORD, dtype=np.float32)
+    ids = np.empty(room, dtype=np.int64)
     workers = threads if room > WORTH_THREADS else 1
-    cursor = np.zeros(len(parts) + 1, np.int64)
+    cursor = np.zeros(len(parts) + 1, dtype=np.int64)
 
     def project() -> None:
         for number, part in enumerate(parts):
@@ -129,7 +131,7 @@ def camera_numbers(camera: PinholeCamera) -> F32:
             *(camera.width, camera.height),
             *((0.0, 0.0, 0.0, 0.0) if rolling is None else (*rolling.time, rolling.reach_px)),
         ],
-        np.float32,
+        dtype=np.float32,
     )
 
 
@@ -156,16 +158,16 @@ def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int)
     # At most 64 chunks of at least 8192 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(8192, -(-count // 64))
-    boxes = np.empty((count, 4), np.int16)
+    boxes = np.empty((count, 4), dtype=np.int16)
     tile_boxes(records, tiles_x, tiles_y, boxes)
-    changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), np.int32)
+    changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), dtype=np.int32)
     workers = min(threads, max(1, len(changes) // 4))  # a millisecond of work for each
-    chunks = (np.zeros(1, np.int64), chunk_size, order, boxes)
+    chunks = (np.zeros(1, dtype=np.int64), chunk_size, order, boxes)
     run_on_threads(workers, count_tiles, *chunks, changes)
     counts = changes.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1, tiles_x * tiles_y)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts
-    lists = np.empty(starts[-1], np.int32)
+    lists = np.empty(starts[-1], dtype=np.int32)
     chunks[0][:] = 0
     run_on_threads(workers, fill_tiles, *chunks, tiles_x, starts[:-1] + before, lists)
     return TileLists(tiles_x, starts, lists)
@@ -178,10 +180,10 @@ def composite(
     depths ``(H, W)``, metres, all without background; ``kept`` is that of `composite_tiles`.
     """
     shape = (camera.height, camera.width)
-    colour = np.empty((*shape, 3), np.float32)
-    alpha = np.empty(shape, np.float32)
-    depth_sum = np.empty(shape, np.float32)
-    lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, records)
+    colour = np.empty((*shape, 3), dtype=np.float32)
+    alpha = np.empty(shape, dtype=np.float32)
+    depth_sum = np.empty(shape, dtype=np.float32)
+    lists = (np.zeros(1, dtype=np.int64), tiles.columns, tiles.starts, tiles.lists, records)
     run_on_threads(threads, composite_tiles, *lists, kept, colour, alpha, depth_sum)
     return colour, alpha, depth_sum
 
@@ -202,7 +204,7 @@ def node_poses(
     Raises:
         InputError: A transform is not rigid.
     """
-    poses = [_IDENTITY, *(np.asarray(T, np.float64) for T in T_world_nodes if T is not None)]
+    poses = [_IDENTITY, *(np.asarray(T, dtype=np.float64) for T in T_world_nodes if T is not None)]
     shaped = all(T.shape == (4, 4) for T in poses)
     if not shaped or not all_rigid(np.array(poses)):
         # The precise message is composed only where the cheap test of all nodes at once fails.
@@ -216,7 +218,7 @@ def node_poses(
         "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
     )
     placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
-    moved = np.array([T is not None for T in T_world_nodes], bool)
+    moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
     # All that stand in the world share the first
     return placed[np.where(moved, np.cumsum(moved), 0)]
 

@@ -90,8 +90,8 @@ class Splats(NamedTuple):
         opacities = np.clip(cloud.opacities, _OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
         arrays = (scales, cloud.quats, logit(opacities), cloud.sh)
         return cls(
-            torch.as_tensor(np.array(cloud.means, np.float64)),
-            *(torch.as_tensor(np.array(array, np.float32)) for array in arrays),
+            torch.as_tensor(np.array(cloud.means, dtype=np.float64)),
+            *(torch.as_tensor(np.array(array, dtype=np.float32)) for array in arrays),
         )
 
 
@@ -354,17 +354,17 @@ Sums = Callable[[Tensor, Tensor, Tensor], Tensor]
 def _on_cpu(records: Tensor, camera: PinholeCamera, threads: int) -> tuple[Images, Sums, Tensor]:
     flat = records.numpy().reshape(-1)
     tiles = list_per_tile(np.arange(len(records)), flat, camera, threads)
-    kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, np.float32)
+    kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, dtype=np.float32)
     colour, alpha, depth = (
         torch.from_numpy(image) for image in composite(tiles, flat, kept, camera, threads)
     )
 
     def sums(*gradients: Tensor) -> Tensor:
-        pairs = np.zeros(len(tiles.lists) * PAIR, np.float32)
-        lists = (np.zeros(1, np.int64), tiles.columns, tiles.starts, tiles.lists, flat)
+        pairs = np.zeros(len(tiles.lists) * PAIR, dtype=np.float32)
+        lists = (np.zeros(1, dtype=np.int64), tiles.columns, tiles.starts, tiles.lists, flat)
         images = (g.to(torch.float32).contiguous().numpy() for g in gradients)
         run_on_threads(threads, tile_gradients, *lists, kept, *images, pairs)
-        rows = np.zeros((len(records), PAIR), np.float32)
+        rows = np.zeros((len(records), PAIR), dtype=np.float32)
         add_pairs(tiles.lists, pairs, rows)
         return torch.from_numpy(rows)
 

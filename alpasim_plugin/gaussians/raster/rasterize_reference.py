@@ -178,7 +178,7 @@ def composite_reference(
     colour = np.zeros((height, width, 3))
     depth_sum = np.zeros((height, width))
     transmittance = np.ones((height, width))
-    finished = np.zeros((height, width), bool)
+    finished = np.zeros((height, width), dtype=bool)
     first = np.clip(np.floor(splats.uv - splats.radii()) - 1, 0, [width, height]).astype(int)
     last = np.clip(np.ceil(splats.uv + splats.radii()) + 1, 0, [width, height]).astype(int)
 

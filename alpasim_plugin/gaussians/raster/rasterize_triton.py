@@ -225,7 +225,7 @@ class UploadedClouds(TileCompositor):
         super().__init__(device)
         for cloud in clouds:
             cloud.require_drawable()
-        self.sizes = np.array([len(cloud) for cloud in clouds], np.int64)
+        self.sizes = np.array([len(cloud) for cloud in clouds], dtype=np.int64)
         self.antialias_px2 = [cloud.antialias_px2 for cloud in clouds]
         self.first = np.cumsum(self.sizes) - self.sizes
         self.sh_size = max((cloud.sh.shape[1] for cloud in clouds), default=1)
@@ -335,7 +335,7 @@ class UploadedClouds(TileCompositor):
         view_clouds = [
             (view, node.cloud) for view, (_, nodes) in enumerate(views) for node in nodes
         ]
-        view, cloud = np.array(view_clouds, np.int64).reshape(-1, 2).T
+        view, cloud = np.array(view_clouds, dtype=np.int64).reshape(-1, 2).T
         blocks = -(-self.sizes[cloud] // BLOCK)
         node = np.repeat(np.arange(len(view_clouds)), blocks)
         before = np.arange(len(node)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
@@ -344,7 +344,7 @@ class UploadedClouds(TileCompositor):
         return np.column_stack([node, first, size, view[node]]).astype(np.int32)
 
     def _upload(self, array: npt.NDArray[Any], dtype: npt.DTypeLike) -> Tensor:
-        return upload(np.asarray(array, dtype), self.device)
+        return upload(np.asarray(array, dtype=dtype), self.device)
 
 
 def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:

@@ -66,7 +66,7 @@ class SkyMask:
         self._eyes = -np.einsum("vji,vj->vi", self._R, T[:, :3, 3])  # (V, 3) world
         self._K = np.array([view.camera.K for view in views]).reshape(-1, 3, 3)
         sizes = [[view.camera.width, view.camera.height] for view in views]
-        self._sizes = np.array(sizes, np.float64).reshape(-1, 2)
+        self._sizes = np.array(sizes, dtype=np.float64).reshape(-1, 2)
         self._names = np.array([view.name for view in views])
 
     def share(self, camera: PinholeCamera, name: str = "") -> F32:
@@ -76,8 +76,8 @@ class SkyMask:
             camera: From where.
             name: Of the camera among those of the views; without it all count alike.
         """
-        share = np.zeros((camera.height, camera.width), np.float32)
-        is_open = np.ones(share.shape, np.bool_)
+        share = np.zeros((camera.height, camera.width), dtype=np.float32)
+        is_open = np.ones(share.shape, dtype=np.bool_)
         for i in self._in_order(camera, name)[:MOST_VIEWS]:
             sky, is_seen = _carried(self._views[i], camera)
             taken = is_open & is_seen
@@ -98,10 +98,12 @@ class SkyMask:
         shows = self._shown_directions(camera)
         cover = shows.mean(axis=1)
         away_m = np.linalg.norm(self._eyes - camera.centre_world, axis=1)
-        is_other = self._names != name if name in self._names else np.zeros(len(cover), np.bool_)
+        is_other = (
+            self._names != name if name in self._names else np.zeros(len(cover), dtype=np.bool_)
+        )
         lacking = np.where(cover < LEAST_COVER, 1 - cover, 0.0)
         order = [int(i) for i in np.lexsort((away_m, is_other, lacking)) if cover[i] > 0]
-        is_open = np.ones(shows.shape[1], np.bool_)
+        is_open = np.ones(shows.shape[1], dtype=np.bool_)
         completing = []
         for i in order:
             if (shows[i] & is_open).any():
@@ -121,7 +123,7 @@ class SkyMask:
         places = projected[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
         # A camera turned by rounding alone sees its own border.
         inside = (places > -1e-6) & (places < self._sizes[..., None] + 1e-6)
-        return np.asarray(inside.all(axis=1) & (depth > 0), np.bool_)
+        return np.asarray(inside.all(axis=1) & (depth > 0), dtype=np.bool_)
 
 
 def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
@@ -147,7 +149,7 @@ def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
         borderMode=cv2.BORDER_REPLICATE,
     )
     is_inside = cv2.warpPerspective(
-        np.ones(view.sky.shape, np.uint8),
+        np.ones(view.sky.shape, dtype=np.uint8),
         to_view,
         size,
         flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,

@@ -24,7 +24,7 @@ WIDTH = 1536
 HEIGHT = 384
 LOW_RAD = np.radians(-20.0)
 HIGH_RAD = np.radians(70.0)
-SPAN_PX = np.array([WIDTH, HEIGHT - 1], np.float32)
+SPAN_PX = np.array([WIDTH, HEIGHT - 1], dtype=np.float32)
 PX_PER_RAD = SPAN_PX / np.array([2 * np.pi, LOW_RAD - HIGH_RAD])
 BLOCK = 16  # rows that are painted at once
 PARTS = 32  # of a pixel, between which colours are interpolated
@@ -199,7 +199,7 @@ def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     ridge = np.radians(1.2) * (
         1 + 0.8 * _periodic_noise(rng, 1, 24, 1) + 0.3 * _periodic_noise(rng, 1, 120, 1)
     )
-    panorama = np.empty((HEIGHT, WIDTH, 3), np.float32)
+    panorama = np.empty((HEIGHT, WIDTH, 3), dtype=np.float32)
     for first in range(0, HEIGHT, BLOCK):  # a block stays in the processor's cache
         part = slice(first, first + BLOCK)
         image = np.repeat(column[part, None, :], WIDTH, axis=1)

@@ -124,7 +124,7 @@ def road_of(camera: PinholeCamera, ground: HeightField, path: F64) -> Road:
         ]
     )
     side = np.where(np.isfinite(usual), np.maximum(np.round(camera.fx * WIDEST_M / usual), 2), 0)
-    return Road(np.asarray(in_reach), np.asarray(side, np.float64))
+    return Road(np.asarray(in_reach), np.asarray(side, dtype=np.float64))
 
 
 def paint_of(rgb: U8, road: Road) -> Bool:

@@ -61,7 +61,7 @@ def fade_in(window: range, previous: range | None, overlap: int) -> F32:
         >>> fade_in(range(17, 42), range(25), 8)[:9].round(3).tolist()
         [0.111, 0.222, 0.333, 0.444, 0.556, 0.667, 0.778, 0.889, 1.0]
     """
-    weights = np.ones(len(window), np.float32)
+    weights = np.ones(len(window), dtype=np.float32)
     if previous is not None:
         n = min(overlap, len(range(window.start, previous.stop)))
         weights[:n] = np.arange(1, n + 1) / (n + 1)

@@ -47,7 +47,7 @@ def swap_class_colours(sdmap: U8, kind: str) -> U8:
             f"choose one of {', '.join(BOX_COLOURS)}",
         )
     # (2, 3): front, back
-    old, new = (np.array(BOX_COLOURS[name], np.float32) for name in (FROM, kind))
+    old, new = (np.array(BOX_COLOURS[name], dtype=np.float32) for name in (FROM, kind))
     out = sdmap.copy()
     inked = sdmap.any(axis=-1)
     pixels = sdmap[inked].astype(np.float32)
@@ -66,9 +66,9 @@ def _paint_distance(pixels: F32) -> F32:
     """Return the distance of pixels ``(N, 3)`` to the nearest marking colour at any brightness, in
     levels ``(N,)``.
     """
-    colours = np.array(list(COLOURS.values()), np.float32)
+    colours = np.array(list(COLOURS.values()), dtype=np.float32)
     directions = colours / np.linalg.norm(colours, axis=1, keepdims=True)
-    nearest = np.full(len(pixels), np.inf, np.float32)
+    nearest = np.full(len(pixels), np.inf, dtype=np.float32)
     # One at a time: vectorised, it takes 18 times the memory of the map
     for direction in directions:
         nearest = np.minimum(

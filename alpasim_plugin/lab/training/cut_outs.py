@@ -28,7 +28,7 @@ def cut_out(rng: np.random.Generator, render: Tensor, tries: int = 2) -> Tensor:
         Like ``render``.
     """
     height, width = render.shape[-2:]
-    keep = np.ones((len(render), height, width), np.float32)
+    keep = np.ones((len(render), height, width), dtype=np.float32)
     for image_weight in keep:
         for _ in range(tries):
             if rng.random() < CHANCE:
@@ -44,11 +44,11 @@ def soft_mask(rng: np.random.Generator, height: int, width: int) -> F32:
     aspect = float(np.exp(rng.uniform(-1, 1)))
     axes = np.sqrt(area * aspect / np.pi), np.sqrt(area / aspect / np.pi)
     centre = float(rng.uniform(0, width)), float(rng.uniform(0, height))
-    mask = np.zeros((height, width), np.float32)
+    mask = np.zeros((height, width), dtype=np.float32)
     cv2.ellipse(
         mask,
         (centre, (2 * float(axes[0]), 2 * float(axes[1])), float(rng.uniform(0, 180))),
         1.0,
         -1,
     )
-    return np.asarray(cv2.GaussianBlur(mask, (0, 0), SIGMA_PX), np.float32)
+    return np.asarray(cv2.GaussianBlur(mask, (0, 0), SIGMA_PX), dtype=np.float32)

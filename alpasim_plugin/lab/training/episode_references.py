@@ -87,7 +87,7 @@ def pair_references(
     w, 4)``; zero where there is none.
     """
     out = np.zeros(
-        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8
+        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), dtype=np.uint8
     )
     opened = _opened(sequence)
     if opened is None or not draw.count:
@@ -142,7 +142,7 @@ def video_references(
 ) -> U8:
     """Return the same for a recorded video, whose neighbouring frames stand for the recording."""
     out = np.zeros(
-        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), np.uint8
+        (len(index), SLOTS, rows.stop - rows.start, columns.stop - columns.start, 4), dtype=np.uint8
     )
     rng = stream("training", draw.seed, "references.video")
     away = rng.integers(*FLOW_FRAMES, SLOTS) * rng.choice([-1, 1], SLOTS)
@@ -178,7 +178,7 @@ def _carried(target: U8, source: U8, bent: F32 | None) -> U8:
     agrees = np.linalg.norm(forward + back, axis=-1) < CONSISTENT_PX
     inside = (pixel >= 0).all(-1) & (pixel[..., 0] <= width - 1) & (pixel[..., 1] <= height - 1)
     pixel = pixel if bent is None else pixel + bent
-    out = np.empty((height, width, 4), np.uint8)
+    out = np.empty((height, width, 4), dtype=np.uint8)
     out[..., :3] = cv2.remap(
         np.ascontiguousarray(source),
         pixel[..., 0],

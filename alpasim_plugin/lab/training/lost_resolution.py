@@ -45,7 +45,7 @@ class LostResolution:
         height, width = self.opacity.shape
         coarse = (max(width // self.cell_px, 1), max(height // self.cell_px, 1))
         # In C order, whatever the frames' own is: the loop writes into a view of it
-        out = np.empty(frames.shape, frames.dtype)
+        out = np.empty(frames.shape, dtype=frames.dtype)
         for image, made in zip(
             frames.reshape(-1, height, width), out.reshape(-1, height, width), strict=True
         ):
@@ -61,7 +61,7 @@ def draw_lost_resolution(rng: np.random.Generator, height: int, width: int) -> L
     """Draw a damage for crops of ``height`` x ``width`` pixels."""
     patches = rng.random((max(height // PATCH_PX, 1), max(width // PATCH_PX, 1)), np.float32)
     blurred = cv2.GaussianBlur(cv2.resize(patches, (width, height)), (0, 0), PATCH_PX / 3)
-    opacity = np.ones((height, width), np.float32)
+    opacity = np.ones((height, width), dtype=np.float32)
     y, x = np.mgrid[:height, :width].astype(np.float32)
     for _ in range(int(rng.integers(HOLES[0], HOLES[1] + 1))):
         radius = rng.uniform(*RADIUS_PX)

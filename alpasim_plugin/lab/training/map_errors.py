@@ -82,7 +82,7 @@ def is_paint(sdmap: U8) -> Bool:
     """Return which pixels of maps ``(..., H, W, 3)`` show lane markings, at any brightness."""
     colour = sdmap.astype(np.float32)
     length = np.linalg.norm(colour, axis=-1)
-    paint_colours = np.array([COLOURS[name] for name in PAINT], np.float32)
+    paint_colours = np.array([COLOURS[name] for name in PAINT], dtype=np.float32)
     paint_colours /= np.linalg.norm(paint_colours, axis=1, keepdims=True)
     alike = (colour @ paint_colours.T).max(axis=-1) > ALIKE * length
     painted: Bool = alike & (length > 0)

@@ -380,7 +380,7 @@ class TrainingStreams:
         render = (
             _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
         )
-        opacity: F32 = np.ones((len(index), 1, *self.crop), np.float32)
+        opacity: F32 = np.ones((len(index), 1, *self.crop), dtype=np.float32)
         if episode.lost:
             render = episode.lost.apply(target)
             opacity = opacity * episode.lost.opacity
@@ -447,7 +447,7 @@ def _lit_references(references: U8, episode: Episode) -> F32:
     gain; the last channel to 0..1.
     """
     flipped = references[:, :, :, ::-1] if episode.flip else references
-    out = np.empty(flipped.shape, np.float32)
+    out = np.empty(flipped.shape, dtype=np.float32)
     for c in range(3):
         out[..., c] = episode.levels[flipped[..., c], c]
     gains = episode.references.gains.astype(np.float32)[None, :, None, None]

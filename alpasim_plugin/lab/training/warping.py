@@ -83,5 +83,6 @@ def _grey(frames: Tensor) -> list[list[np.ndarray]]:
 
 def _farneback(earlier: np.ndarray, present: np.ndarray) -> F32:
     return np.asarray(
-        cv2.calcOpticalFlowFarneback(earlier, present, None, 0.5, 3, 21, 3, 5, 1.2, 0), np.float32
+        cv2.calcOpticalFlowFarneback(earlier, present, None, 0.5, 3, 21, 3, 5, 1.2, 0),
+        dtype=np.float32,
     )
