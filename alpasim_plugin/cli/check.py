@@ -18,6 +18,7 @@ from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
+from alpasim_plugin.core.types import RolloutLog, Scene
 from alpasim_plugin.log.run_folder.check import inspect_files, inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cameras import recorded_requests
@@ -145,6 +146,15 @@ def check_renderer(
     )
 
 
+def _outcomes(log: RolloutLog, scene: Scene) -> tuple[str, ...]:
+    """Return the outcomes of a logged rollout, by the paper's preset."""
+    values = reduce_rollout(score(log, scene, preset="paper"), "paper").as_dict()
+    measured = {name: values[name] for name in OUTCOMES if name in values}
+    return tuple(
+        name for name, entry in measured.items() if entry["valid"] and entry["value"] >= 0.5
+    )
+
+
 def check_driver(
     address: Annotated[
         str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")
@@ -172,15 +182,7 @@ def check_driver(
         warmup += scene.warmup_us // scene.rates.policy_us + 1
         try:
             log = run_rollout(scene, make_renderer("clean", scene), policy).log()
-            values = reduce_rollout(score(log, scene.scene, preset="paper"), "paper").as_dict()
-            measured = {name: values[name] for name in OUTCOMES if name in values}
-            ended[scene.scene_id] = in_words(
-                tuple(
-                    name
-                    for name, entry in measured.items()
-                    if entry["valid"] and entry["value"] >= 0.5
-                )
-            )
+            ended[scene.scene_id] = in_words(_outcomes(log, scene.scene))
         except (PolicyError, InfrastructureError) as error:
             ended[scene.scene_id], failed = error.message, failed or error
             if isinstance(error, InfrastructureError):

@@ -72,70 +72,97 @@ def compare(
             warn(note)
     opened = [read_run(run) for run in folders]
     if len(folders) == 2 and {*opened[0].scenes} & {*opened[1].scenes}:
-        result = compare_runs(opened[0], opened[1], baseline, EVERY_MISSING)
-        means = None
+        comparison = compare_runs(opened[0], opened[1], baseline, EVERY_MISSING)
+        whole = None
     elif len(folders) > 1:
-        joined = aggregate_runs(folders, baseline)
-        result = Comparison(
-            joined.paired,
-            joined.paired_with_base,
-            joined.paired_policies,
-            metrics=joined_metrics(folders),
-        )
-        whole = [rollout for run in opened for rollout in run.rollouts]
-        scenario_names = list(
-            dict.fromkeys(name for run in opened for name in run.info.asked or ())
-        )
-        scenes = {name: facts for run in opened for name, facts in run.info.scenes.items()}
-        info = replace(opened[0].info, asked=tuple(scenario_names), scenes=scenes)
-        means = _with_endings(joined, opened, whole)
-        overview_run = replace(opened[0], summary=means, rollouts=whole, info=info)
+        comparison, whole = _joined(opened, baseline)
     else:
-        result = compare_within(opened[0], baseline, EVERY_MISSING)
-        means = opened[0].summary
-        overview_run = opened[0]
+        comparison = compare_within(opened[0], baseline, EVERY_MISSING)
+        whole = opened[0]
     facts: dict[str, Any] = {
         "runs": [str(run) for run in folders],
-        "notes": list(result.notes),
-        **{block: _tables_as_json(getattr(result, block)) for block in BLOCKS},
+        "notes": list(comparison.notes),
+        **{block: _tables_as_json(getattr(comparison, block)) for block in BLOCKS},
     }
     lines = []
-    if means is not None:
+    if whole is not None:
+        means = whole.summary
         facts |= {
             "preset": means.preset,
             "metrics": _tables_as_json(means.metrics),
             "failures": to_json(means.failures),
         }
-        lines += first_screen(overview_run)
-        if all_metrics:
-            lines += metric_lines(means, known=result.metrics)
-        failures = means.failures
-        if failures.n_failed:
-            causes = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())
-            number = f"{failures.n_failed} of {failures.n_rollouts}"
-            lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
-    pair_lines = [f"note: {note}" for note in result.notes]
-    for tables in (result.paired, result.paired_with_base, result.paired_policies):
-        for variant, entries in tables.items():
-            baseline = next((entry.baseline for entry in entries.values()), "nothing")
-            pair_lines += ["", f"{variant} minus {baseline}"]
-            rows = [
-                row
-                for row in pair_rows([(variant, entries)], result.metrics)
-                if entries[row.metric].n_cells
-                and (all_metrics or row.metric in result.metrics.headline)
-            ]
-            pair_lines += (
-                _table(rows, entries, result.metrics) if rows else ["  no pair of rollouts"]
-            )
-            missing = _missing(entries, len(entries) if all_metrics else SHOWN)
-            pair_lines += missing if all_metrics else missing[:SHOWN]
-            if len(missing) > SHOWN and not all_metrics:
-                pair_lines.append(f"  {len(missing) - SHOWN} more lines: --all")
+        lines = _mean_lines(whole, comparison.metrics, all_metrics)
     width = terminal_width()
-    for line in pair_lines:
+    for line in _difference_lines(comparison, all_metrics):
         lines += wrap(line, width, subsequent_indent=INDENT, break_on_hyphens=False) or [""]
     show(as_json, facts, *lines)
+
+
+def _joined(shards: Sequence[Run], baseline: str | None) -> tuple[Comparison, Run]:
+    """Return the comparison over the shards of one run, and the run that they make together."""
+    folders = [shard.folder for shard in shards]
+    summary = aggregate_runs(folders, baseline)
+    comparison = Comparison(
+        summary.paired,
+        summary.paired_with_base,
+        summary.paired_policies,
+        metrics=joined_metrics(folders),
+    )
+    rollouts = [rollout for shard in shards for rollout in shard.rollouts]
+    names = dict.fromkeys(name for shard in shards for name in shard.info.asked or ())
+    scenes = {name: scene for shard in shards for name, scene in shard.info.scenes.items()}
+    whole = replace(
+        shards[0],
+        summary=_with_endings(summary, shards, rollouts),
+        rollouts=rollouts,
+        info=replace(shards[0].info, asked=tuple(names), scenes=scenes),
+    )
+    return comparison, whole
+
+
+def _mean_lines(run: Run, metric_table: MetricTable, all_metrics: bool) -> list[str]:
+    """Return what a run's first screen shows, its means where all metrics are asked for, and how
+    many rollouts are in none.
+    """
+    lines = list(first_screen(run))
+    if all_metrics:
+        lines += metric_lines(run.summary, known=metric_table)
+    failures = run.summary.failures
+    if failures.n_failed:
+        causes = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())
+        number = f"{failures.n_failed} of {failures.n_rollouts}"
+        lines.append(f"{number} rollouts failed ({causes}) and are in no mean")
+    return lines
+
+
+def _difference_lines(comparison: Comparison, all_metrics: bool) -> list[str]:
+    """Return the notes of a comparison, and for each variant a table of its paired differences."""
+    lines = [f"note: {note}" for note in comparison.notes]
+    for block in BLOCKS:
+        for variant, differences in getattr(comparison, block).items():
+            lines += _variant_lines(variant, differences, comparison.metrics, all_metrics)
+    return lines
+
+
+def _variant_lines(
+    variant: str,
+    differences: Mapping[str, Difference],
+    metric_table: MetricTable,
+    all_metrics: bool,
+) -> list[str]:
+    """Return the table of one variant's differences and the pairs that are missing."""
+    baseline = next((difference.baseline for difference in differences.values()), "nothing")
+    rows = [
+        row
+        for row in pair_rows([(variant, differences)], metric_table)
+        if differences[row.metric].n_cells and (all_metrics or row.metric in metric_table.headline)
+    ]
+    table = _table(rows, differences, metric_table) if rows else ["  no pair of rollouts"]
+    missing = _missing(differences, len(differences) if all_metrics else SHOWN)
+    if len(missing) > SHOWN and not all_metrics:
+        missing = [*missing[:SHOWN], f"  {len(missing) - SHOWN} more lines: --all"]
+    return ["", f"{variant} minus {baseline}", *table, *missing]
 
 
 def _tables_as_json(tables: Mapping[str, Mapping[str, Mean | Difference]]) -> JsonObject:

@@ -16,6 +16,7 @@ from alpasim_plugin.core.errors import InfrastructureError, SimrunError
 from alpasim_plugin.core.files import places
 from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.flags import Flag
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.runs.provenance import hardware, versions
 
 EPILOG = "Example: `simrun doctor --json`"
@@ -30,18 +31,7 @@ def doctor(
 ) -> None:
     """Test each part on a small case and report what fails."""
     if gpu:
-        # One line a section as it ends; 0 if the card agrees with the CPU.
-        from alpasim_plugin.runs.gpu_check import check_gpu
-
-        device = require_device("cuda")
-        sections = {}
-        for section, facts in check_gpu(device, budget_s):
-            sections[section] = facts
-            if not as_json:
-                show(False, facts, f"{section:>12}  {json.dumps(facts)}")
-        if as_json:
-            show(True, {"device": device, "sections": sections})
-        raise typer.Exit(0 if all(section["ok"] for section in sections.values()) else 4)
+        raise typer.Exit(_check_gpu(budget_s, as_json))
     rows = []
     for name, check in CHECKS.items():
         row = {"check": name, "ok": True, "needed": name in NEEDED, "found": "", "do": ""}
@@ -52,13 +42,39 @@ def doctor(
         rows.append(row)
     machine = hardware() | versions()
     lines = [f"{key:>32}  {value}" for key, value in machine.items()]
-    for row in rows:
-        mark = "ok" if row["ok"] else "BROKEN" if row["needed"] else "absent"
-        advice = f" -> {row['do']}" if row["do"] else ""
-        lines.append(f"{row['check']:>32}  {mark}: {row['found']}{advice}")
+    lines += [_check_line(row) for row in rows]
     facts = {"hardware": hardware(), "versions": versions(), "checks": rows}
     show(as_json, facts, *lines)
     raise typer.Exit(4 if any(row["needed"] and not row["ok"] for row in rows) else 0)
+
+
+def _check_gpu(budget_s: float, as_json: bool) -> int:
+    """Compare the card with the CPU and time it, a line a section as it ends; return 0 if they
+    agree.
+    """
+    from alpasim_plugin.runs.gpu_check import check_gpu
+
+    device = require_device("cuda")
+    sections = {}
+    for section, facts in check_gpu(device, budget_s):
+        sections[section] = facts
+        if not as_json:
+            show(False, facts, f"{section:>12}  {json.dumps(facts)}")
+    if as_json:
+        show(True, {"device": device, "sections": sections})
+    return 0 if all(section["ok"] for section in sections.values()) else 4
+
+
+def _check_line(row: JsonView) -> str:
+    """Return the line of one check: what works, or what is broken or absent and what to do."""
+    if row["ok"]:
+        mark = "ok"
+    elif row["needed"]:
+        mark = "BROKEN"
+    else:
+        mark = "absent"
+    advice = f" -> {row['do']}" if row["do"] else ""
+    return f"{row['check']:>32}  {mark}: {row['found']}{advice}"
 
 
 def _raster(backend: Literal["cpu", "triton"]) -> str:

@@ -19,6 +19,7 @@ from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
 from evaluators.pages.ci import write_gate_files
 from evaluators.statistics.baselines import (
+    Baseline,
     check_matches,
     is_repeatable,
     read_baseline,
@@ -27,9 +28,15 @@ from evaluators.statistics.baselines import (
 )
 from evaluators.statistics.boundary_gate import boundary_verdict
 from evaluators.statistics.decision import stopping_note
-from evaluators.statistics.gate import GateVerdict, check_gate, check_number_of_scenes, load_gate
+from evaluators.statistics.gate import (
+    GateSpec,
+    GateVerdict,
+    check_gate,
+    check_number_of_scenes,
+    load_gate,
+)
 from evaluators.statistics.numbers import plural
-from evaluators.statistics.opening import read_run
+from evaluators.statistics.opening import Run, read_run
 from scenarios.suite import load_suite
 
 EPILOG = """
@@ -89,47 +96,51 @@ def gate(
     if note := stopping_note(run):
         warn(note)
     spec, source = load_gate(gate_file, stored_run.table)
-    preset = stored_run.summary.preset
-    if spec.preset is not None and spec.preset != preset:
-        raise InputError(
-            f"{run}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
-            "Score the run with that preset.",
-        )
-    if spec.boundary_margin is not None:
-        earlier = None if baseline_file is None else read_run(baseline_file).summary
-        verdict = boundary_verdict(
-            table_of_run(stored_run),
-            spec,
-            stored_run.summary.boundary,
-            None if earlier is None else earlier.boundary or {},
-            str(baseline_file or ""),
-        )
-    else:
-        stored = None
-        repeatable = is_repeatable(stored_run)
-        if baseline_file is not None:
-            if os.path.isdir(baseline_file):
-                ensure_tables(baseline_file, warn)
-            baseline = read_baseline(baseline_file)
-            check_matches(baseline, stored_run, baseline_file)
-            stored = baseline.table
-            if baseline.repeatable is False:
-                repeatable = False
-        verdict = check_gate(
-            table_of_run(stored_run),
-            spec,
-            stored,
-            str(baseline_file or ""),
-            stored_run.table,
-            preset,
-            repeatable,
-        )
+    verdict = _verdict(stored_run, spec, source, baseline_file)
     files = write_gate_files(verdict, source, stored_run, out or run)
     if out is None and os.path.isfile(run / PAGES[0]):
         write_reports(run)
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
     show(as_json, facts, *verdict_lines(verdict))
     raise typer.Exit(verdict.exit_code)
+
+
+def _verdict(run: Run, spec: GateSpec, source: str, baseline_file: Path | None) -> GateVerdict:
+    """Return the verdict on a run by the gate ``spec``, which ``source`` names.
+
+    Raises:
+        InputError: The gate is for another preset, or the baseline is of other scenes or metrics.
+    """
+    preset = run.summary.preset
+    if spec.preset is not None and spec.preset != preset:
+        raise InputError(
+            f"{run.folder}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
+            "Score the run with that preset.",
+        )
+    baseline_name = str(baseline_file or "")
+    if spec.boundary_margin is not None:
+        earlier = None
+        if baseline_file is not None:
+            earlier = read_run(baseline_file).summary.boundary or {}
+        boundary = run.summary.boundary
+        return boundary_verdict(table_of_run(run), spec, boundary, earlier, baseline_name)
+    repeatable = is_repeatable(run)
+    stored = None
+    if baseline_file is not None:
+        baseline = _baseline(baseline_file, run)
+        stored = baseline.table
+        if baseline.repeatable is False:
+            repeatable = False
+    return check_gate(table_of_run(run), spec, stored, baseline_name, run.table, preset, repeatable)
+
+
+def _baseline(path: Path, run: Run) -> Baseline:
+    """Read a stored baseline, or an earlier run, that a run is compared with."""
+    if os.path.isdir(path):
+        ensure_tables(path, warn)
+    baseline = read_baseline(path)
+    check_matches(baseline, run, path)
+    return baseline
 
 
 def verdict_lines(verdict: GateVerdict) -> list[str]:

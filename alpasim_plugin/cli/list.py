@@ -3,6 +3,7 @@
 What a kind needs is imported where it is listed, so that a short list loads no numerical library.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -50,37 +51,64 @@ def list_names(
         return
     if roots or renderer or policy or metric:
         raise InputError(f"simrun list {kind}: filters are for runs", "Leave them out.")
-    if kind is None:
-        descriptions = {name: f"simrun list {name}" for name in get_args(Kind)}
-    elif kind == "renderers":
-        descriptions = names("renderer")
-        for name, text in names("fixer").items():
-            descriptions[name] = f"3dgs, repaired by the fixer {name}: {text}"
-    elif kind == "fixers":
-        descriptions = {}
-        for fixer, help_text in names("fixer").items():
-            spec = unidentified("fixer", fixer)
-            factory = load(spec.target, "fixer")
-            help_text = getattr(factory, "help", {}).get(fixer, help_text)
-            descriptions[fixer] = (
-                f"{help_text} [{note_of(spec, declaration_of(factory, spec.settings))}]"
-            )
-    elif kind == "policies":
-        descriptions = names("policy")
-    elif kind == "scenarios":
-        from scenarios.suite import shipped
-
-        descriptions = shipped()
-    elif kind == "metrics":
-        from evaluators.metrics import table_of
-        from evaluators.metrics.score import resolve_plugins
-
-        descriptions = {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
-    else:
-        from evaluators.metrics.presets import described
-
-        descriptions = described()
+    descriptions = DESCRIPTIONS[kind]() if kind is not None else _kinds()
     width = max((len(name) for name in descriptions), default=0)
     show(
         as_json, descriptions, *(f"{name:<{width}}  {text}" for name, text in descriptions.items())
     )
+
+
+def _kinds() -> Mapping[str, str]:
+    return {name: f"simrun list {name}" for name in get_args(Kind)}
+
+
+def _renderers() -> Mapping[str, str]:
+    descriptions = names("renderer")
+    for name, text in names("fixer").items():
+        descriptions[name] = f"3dgs, repaired by the fixer {name}: {text}"
+    return descriptions
+
+
+def _fixers() -> Mapping[str, str]:
+    descriptions = {}
+    for fixer, help_text in names("fixer").items():
+        spec = unidentified("fixer", fixer)
+        factory = load(spec.target, "fixer")
+        help_text = getattr(factory, "help", {}).get(fixer, help_text)
+        declaration = declaration_of(factory, spec.settings)
+        descriptions[fixer] = f"{help_text} [{note_of(spec, declaration)}]"
+    return descriptions
+
+
+def _policies() -> Mapping[str, str]:
+    return names("policy")
+
+
+def _scenarios() -> Mapping[str, str]:
+    from scenarios.suite import shipped
+
+    return shipped()
+
+
+def _metrics() -> Mapping[str, str]:
+    from evaluators.metrics import table_of
+    from evaluators.metrics.score import resolve_plugins
+
+    return {name: facts.help for name, facts in table_of(resolve_plugins()).items()}
+
+
+def _presets() -> Mapping[str, str]:
+    from evaluators.metrics.presets import described
+
+    return described()
+
+
+# What each kind lists: a name, and a sentence about it.
+DESCRIPTIONS = {
+    "renderers": _renderers,
+    "fixers": _fixers,
+    "policies": _policies,
+    "scenarios": _scenarios,
+    "metrics": _metrics,
+    "presets": _presets,
+}

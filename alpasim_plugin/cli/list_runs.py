@@ -39,22 +39,28 @@ def list_runs(
         if _each_is_named(renderers, () if entry.info is None else entry.info.renderers)
         and _each_is_named(policies, () if entry.info is None else entry.info.policies)
     ]
-    stored = {
-        name
-        for entry in chosen
-        if entry.summary is not None
-        for table in entry.summary.metrics.values()
-        for name in table
-    }
-    for name in metrics:
-        if name not in METRICS and name not in stored:
-            raise InputError(f"--metric {name}: no such metric", "simrun list metrics names them.")
+    unknown = [name for name in metrics if name not in METRICS.keys() | _stored_metrics(chosen)]
+    if unknown:
+        raise InputError(
+            f"--metric {unknown[0]}: no such metric", "simrun list metrics names them."
+        )
     rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
     lines: list[Any] = [runs_table(chosen, roots[0], metrics)] if chosen else []
     count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
     show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
+    if not as_json:
+        _warn_of_unreadable(entries)
+
+
+def _stored_metrics(entries: Sequence[RunEntry]) -> set[str]:
+    """Return the names of all metrics that the summaries of runs hold."""
+    summaries = [entry.summary for entry in entries if entry.summary is not None]
+    return {name for summary in summaries for table in summary.metrics.values() for name in table}
+
+
+def _warn_of_unreadable(entries: Sequence[RunEntry]) -> None:
     for entry in entries:
-        if not as_json and entry.info is None:
+        if entry.info is None:
             warn(f"left out, its run.json cannot be read: {entry.folder}: {entry.problem}")
 
 

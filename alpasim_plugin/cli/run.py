@@ -3,9 +3,9 @@
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -38,12 +38,12 @@ from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.schema import LOCK, OUTPUT_NAME
 from alpasim_plugin.runs.decide import SequentialTest, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
-from alpasim_plugin.runs.executor_choice import parse_executor
+from alpasim_plugin.runs.executor_choice import Executor, parse_executor
 from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
-from alpasim_plugin.runs.vary import BoundarySearch, parse_sweeps
+from alpasim_plugin.runs.vary import BoundarySearch, Sweep, parse_sweeps
 from evaluators import preset as find_preset
 from evaluators.pages.decision import decision_lines
 from evaluators.results import FailedRollout, to_json
@@ -55,6 +55,7 @@ from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand
 
 SHOWN_FAILURES = 5
+Planner = Callable[[Sequence[ScenarioRef]], RunPlan]
 
 EPILOG = """
 Examples:
@@ -75,6 +76,156 @@ Examples:
 """
 
 
+@dataclass(frozen=True)
+class Rollouts:
+    """Which rollouts are driven, beside the scenarios."""
+
+    renderer: Annotated[
+        str,
+        Flag(
+            "Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.",
+            names="renderer",
+        ),
+    ] = "3dgs"
+    policy: Annotated[
+        str,
+        Flag(
+            "Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.",
+            names="policy",
+        ),
+    ] = "lane-camera"
+    seeds: Annotated[str, Flag("How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1"
+    overrides: Annotated[
+        tuple[str, ...],
+        Flag(
+            "Override a key of the scenarios, key=value, or of a fixer, [RENDERER:]fixer.key=value. Repeatable.",
+            "--set",
+        ),
+    ] = ()
+    start: Annotated[
+        str | None, Flag("Start of the route on a map, ROAD:S; by default drawn.", "--from")
+    ] = None
+    goal: Annotated[str | None, Flag("End of the route, ROAD:S.", "--to")] = None
+    source: Annotated[
+        str | None,
+        Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
+    ] = None
+    shard: Annotated[str | None, Flag("Drive this part of the scenes alone.", metavar="I/N")] = None
+
+    def settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the settings ``KEY=VALUE`` of the scenarios, the ends of the route among them, and
+        those of the fixers.
+        """
+        ends = {"from": self.start, "to": self.goal}
+        route = [f"map.route.{key}={place}" for key, place in ends.items() if place is not None]
+        return split_overrides((*self.overrides, *route))
+
+    def scenes(self, scenarios: Sequence[str]) -> list[ScenarioRef]:
+        """Return the scenes of the scenarios that the command names, or of its shard of them."""
+        of_scene, _ = self.settings()
+        refs = _scenes(scenarios, of_scene, self.source)
+        return refs if self.shard is None else shard_of(refs, self.shard)
+
+    def planner(self, options: RunOptions) -> Planner:
+        """Return the function that plans these rollouts of some scenes."""
+        _, of_fixer = self.settings()
+        return partial(
+            make_plan,
+            renderers=split_names(self.renderer),
+            policies=split_policies(self.policy),
+            seeds=parse_seeds(self.seeds),
+            options=replace(options, fixer=of_fixer),
+        )
+
+
+@dataclass(frozen=True)
+class Execution:
+    """Where and how the rollouts are driven; the results do not depend on it."""
+
+    workers: Annotated[
+        int | None,
+        Flag("Worker processes; default: one per core.", min=1),
+    ] = None
+    executor: Annotated[
+        str,
+        Flag("`local`, or `ray[:HOST:PORT]` with what a worker needs: `ray?cores=2&memory=8`."),
+    ] = "local"
+    report: Annotated[
+        bool,
+        Flag("Write report.html; `simrun report` writes it later.", "--report/--no-report"),
+    ] = True
+    time_limit: Annotated[
+        float | None,
+        Flag("Seconds after which a rollout is ended and reported.", min=0.001),
+    ] = None
+    out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None
+    resume: Annotated[
+        bool, Flag("Continue in a folder that another command has written.", "--resume")
+    ] = False
+    repeat: Annotated[
+        bool,
+        Flag("Drive a rollout of each policy twice and compare.", "--repeat"),
+    ] = False
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What is searched for, where the rollouts are not all driven."""
+
+    until_decided: Annotated[
+        bool,
+        Flag(
+            "Sequential test: stop as soon as the comparison is decided.",
+            "--until-decided",
+        ),
+    ] = False
+    metric: Annotated[
+        tuple[str, ...],
+        Flag(
+            "With --until-decided: NAME=MARGIN instead of the default gate's. Repeatable.",
+            metavar="NAME[=MARGIN]",
+        ),
+    ] = ()
+    vary: Annotated[
+        tuple[str, ...],
+        Flag(
+            "Find where each variant starts to fail along a key, or two. Repeatable.",
+            metavar="KEY=LOW..HIGH",
+        ),
+    ] = ()
+
+    def sweeps(self, n_scenes: int, execution: Execution) -> tuple[Sweep, ...]:
+        """Return the keys that are varied.
+
+        Raises:
+            InputError: A key is varied beside what excludes it, or its range cannot be read.
+        """
+        sweeps = parse_sweeps(self.vary)
+        excluded = self.until_decided or execution.repeat or execution.resume
+        if sweeps and (n_scenes != 1 or excluded):
+            raise InputError(
+                f"--vary {self.vary[0]}: takes one scene, and no --until-decided, --repeat or --resume",
+                "Name one scene and leave these options out.",
+            )
+        return sweeps
+
+    def over(
+        self, plan: RunPlan, sweeps: tuple[Sweep, ...], planned: Planner
+    ) -> SequentialTest | BoundarySearch | None:
+        """Return the search over a plan; None where all of it is driven.
+
+        Raises:
+            InputError: ``--metric`` stands without ``--until-decided``, or the plan cannot answer
+                the question.
+        """
+        if self.metric and not self.until_decided:
+            raise InputError("--metric: without --until-decided", "Add --until-decided.")
+        if self.until_decided:
+            question = question_of(self.metric)
+            return SequentialTest(plan_of_two(plan, question), question)
+        return BoundarySearch(plan, sweeps, planned) if sweeps else None
+
+
 def run(
     scenarios: Annotated[
         tuple[str, ...],
@@ -85,84 +236,9 @@ def run(
         ),
     ],
     options: RunOptions,
-    renderer: Annotated[
-        str,
-        Flag(
-            "Renderers, comma-separated: a name, `FIXER`, `FIXER+RENDERER`, or `package.module:Class`.",
-            names="renderer",
-        ),
-    ] = "3dgs",
-    policy: Annotated[
-        str,
-        Flag(
-            "Policies, comma-separated: a name, `package.module:Class`, `file.py:Class` or `exec:COMMAND`.",
-            names="policy",
-        ),
-    ] = "lane-camera",
-    seeds: Annotated[str, Flag("How many seeds (3 means 0,1,2), or a list such as 4,7.")] = "1",
-    overrides: Annotated[
-        tuple[str, ...],
-        Flag(
-            "Override a key of the scenarios, key=value, or of a fixer, [RENDERER:]fixer.key=value. Repeatable.",
-            "--set",
-        ),
-    ] = (),
-    start: Annotated[
-        str | None, Flag("Start of the route on a map, ROAD:S; by default drawn.", "--from")
-    ] = None,
-    goal: Annotated[str | None, Flag("End of the route, ROAD:S.", "--to")] = None,
-    source: Annotated[
-        str | None,
-        Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        Flag("Worker processes; default: one per core.", min=1),
-    ] = None,
-    executor: Annotated[
-        str,
-        Flag("`local`, or `ray[:HOST:PORT]` with what a worker needs: `ray?cores=2&memory=8`."),
-    ] = "local",
-    report: Annotated[
-        bool,
-        Flag("Write report.html; `simrun report` writes it later.", "--report/--no-report"),
-    ] = True,
-    time_limit: Annotated[
-        float | None,
-        Flag("Seconds after which a rollout is ended and reported.", min=0.001),
-    ] = None,
-    out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None,
-    shard: Annotated[
-        str | None, Flag("Drive this part of the scenes alone.", metavar="I/N")
-    ] = None,
-    resume: Annotated[
-        bool, Flag("Continue in a folder that another command has written.", "--resume")
-    ] = False,
-    until_decided: Annotated[
-        bool,
-        Flag(
-            "Sequential test: stop as soon as the comparison is decided.",
-            "--until-decided",
-        ),
-    ] = False,
-    metric: Annotated[
-        tuple[str, ...],
-        Flag(
-            "With --until-decided: NAME=MARGIN instead of the default gate's. Repeatable.",
-            metavar="NAME[=MARGIN]",
-        ),
-    ] = (),
-    vary: Annotated[
-        tuple[str, ...],
-        Flag(
-            "Find where each variant starts to fail along a key, or two. Repeatable.",
-            metavar="KEY=LOW..HIGH",
-        ),
-    ] = (),
-    repeat: Annotated[
-        bool,
-        Flag("Drive a rollout of each policy twice and compare.", "--repeat"),
-    ] = False,
+    rollouts: Rollouts,
+    execution: Execution,
+    search_options: SearchOptions,
     dry_run: Annotated[bool, Flag("Print the plan and run nothing.", "--dry-run")] = False,
     as_json: Json = False,
     quiet: Annotated[bool, Flag("Print only the result.", "--quiet", also="-q")] = False,
@@ -171,93 +247,65 @@ def run(
 
     An interrupted run continues when the same command is given again.
     """
-    ray = parse_executor(executor)
+    executor = parse_executor(execution.executor)
     find_preset(options.preset)
-    ends = {"from": start, "to": goal}
-    route = [f"map.route.{key}={place}" for key, place in ends.items() if place is not None]
-    of_scene, of_fixer = split_overrides((*overrides, *route))
-    refs = _scenes(scenarios, of_scene, source)
-    if shard is not None:
-        refs = shard_of(refs, shard)
-    planned = partial(
-        make_plan,
-        renderers=split_names(renderer),
-        policies=split_policies(policy),
-        seeds=parse_seeds(seeds),
-        options=replace(options, fixer=of_fixer),
-    )
-    sweeps = parse_sweeps(vary)
-    if sweeps and (len(refs) != 1 or until_decided or repeat or resume):
-        raise InputError(
-            f"--vary {vary[0]}: takes one scene, and no --until-decided, --repeat or --resume",
-            "Name one scene and leave these options out.",
-        )
+    refs = rollouts.scenes(scenarios)
+    planned = rollouts.planner(options)
+    sweeps = search_options.sweeps(len(refs), execution)
     plan = replace(planned(refs), scenario_names=scenarios)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
-    search: SequentialTest | BoundarySearch | None = None
-    if until_decided:
-        question = question_of(metric)
-        search = SequentialTest(plan_of_two(plan, question), question)
-    elif metric:
-        raise InputError("--metric: without --until-decided", "Add --until-decided.")
-    if sweeps:
-        search = BoundarySearch(plan, sweeps, planned)
+    search = search_options.over(plan, sweeps, planned)
     if search is not None:
         plan = search.ceiling
-    root = out or default_folder(plan)
+    root = execution.out or default_folder(plan)
     if dry_run:
         with suppress(FileNotFoundError):
             os.lstat(root / LOCK)  # raises where no such folder can be
-        _print_plan(plan, root, thread_budget(workers, len(plan.cells), ray), as_json)
+        threads = thread_budget(execution.workers, len(plan.cells), executor)
+        _print_plan(plan, root, threads, as_json)
         return
-    command = ["simrun", *sys.argv[1:]]
-    try:
-        with Progress(quiet or as_json) as progress:
-            if search is None:
-                result = execute_run(
-                    plan,
-                    root,
-                    workers,
-                    command,
-                    progress,
-                    resume,
-                    repeat,
-                    report,
-                    limit_s=time_limit,
-                    executor=ray,
-                )
-            else:
-                result = execute_search(
-                    search,
-                    root,
-                    workers,
-                    command,
-                    progress,
-                    report=report,
-                    limit_s=time_limit,
-                    executor=ray,
-                )
-    except Stopped as stop:
-        stop.kept = f"finished rollouts are kept in {root}; the same command continues"
-        raise
+    with Progress(quiet or as_json) as progress:
+        result = _drive(plan, search, root, execution, executor, progress)
     if isinstance(search, SequentialTest):
         _print_decision(search, root, as_json)
         raise typer.Exit(search.outcome.exit_code)
-    if as_json:
-        facts = {
-            "out": str(root),
-            "exit_code": result.exit_code,
-            "summary": to_json(result.summary),
-        }
-        show(as_json, facts)
-    else:
-        _print_result(result)
-        if plan.undigested:
-            names = ", ".join(plan.undigested)
-            warn(f"--resume reuses the rollouts of {names}; the same command drives them again.")
+    _print_result(result, plan, as_json)
     raise typer.Exit(result.exit_code)
+
+
+def _drive(
+    plan: RunPlan,
+    search: SequentialTest | BoundarySearch | None,
+    root: Path,
+    execution: Execution,
+    executor: Executor,
+    progress: Progress,
+) -> RunResult:
+    """Drive a whole plan, or the rounds of a search in it, into the run folder ``root``.
+
+    Raises:
+        Stopped: The user stopped the run; it says that the same command continues.
+    """
+    drive = (
+        partial(execute_run, plan, resume=execution.resume, repeat=execution.repeat)
+        if search is None
+        else partial(execute_search, search)
+    )
+    try:
+        return drive(
+            root=root,
+            workers=execution.workers,
+            command=["simrun", *sys.argv[1:]],
+            progress=progress,
+            report=execution.report,
+            limit_s=execution.time_limit,
+            executor=executor,
+        )
+    except Stopped as stop:
+        stop.kept = f"finished rollouts are kept in {root}; the same command continues"
+        raise
 
 
 def _scenes(
@@ -377,10 +425,17 @@ def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> N
     show(as_json, facts, *lines)
 
 
-def _print_result(result: RunResult) -> None:
+def _print_result(result: RunResult, plan: RunPlan, as_json: bool) -> None:
+    """Print the table of a run, what failed and what ``--resume`` would not see; or the JSON
+    document.
+    """
     from evaluators.pages.terminal import next_line
 
     root = result.root
+    if as_json:
+        summary = to_json(result.summary)
+        show(True, {"out": str(root), "exit_code": result.exit_code, "summary": summary})
+        return
     run = read_run(root)
     lines = []
     if result.summary.repeat is not None:
@@ -399,3 +454,6 @@ def _print_result(result: RunResult) -> None:
         if by_policy:
             advice = f"{by_policy} by the policy's own fault: simrun check policy tests it"
         warn(f"{result.n_failed} of {plural(result.n_rollouts, 'rollout')} failed; {advice}")
+    if plan.undigested:
+        names = ", ".join(plan.undigested)
+        warn(f"--resume reuses the rollouts of {names}; the same command drives them again.")

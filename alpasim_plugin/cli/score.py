@@ -1,8 +1,9 @@
 """``simrun score``: score rollout logs again without rendering."""
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,7 +18,7 @@ from evaluators import resolve_evaluators
 from evaluators.alpasim import EvalSettings, load_settings
 from evaluators.metrics import presets
 from evaluators.pages.terminal import render_presets
-from evaluators.results import to_json
+from evaluators.results import Summary, to_json
 from evaluators.statistics.opening import read_run
 from evaluators.statistics.verdicts import worst_code
 
@@ -61,10 +62,10 @@ def score(
     aggregation and scene score are written to `aggregate/` as well. Nothing in a log is ever
     unpickled.
     """
-    names = list(dict.fromkeys(part.strip() for part in preset.split(",")))
-    chosen = {name: find_preset(name) for name in names}
+    chosen = {name: find_preset(name) for name in map(str.strip, preset.split(","))}
+    is_alone = len(chosen) == 1
     own_settings = {
-        name: _settings(choice, settings if len(names) == 1 or choice.aliases else None)
+        name: _settings(choice, settings if is_alone or choice.aliases else None)
         for name, choice in chosen.items()
     }
     paths = find_logs(logs)
@@ -80,7 +81,7 @@ def score(
                 choice if preset_settings is None else preset_settings.preset(choice),
                 preset_settings,
                 parts,
-                out if out is None or len(names) == 1 else out / name,
+                out if out is None or is_alone else out / name,
                 ["simrun", *sys.argv[1:]],
                 lambda manifest: progress.rollout_done(manifest, reused=False),
                 progress.noticed,
@@ -88,26 +89,40 @@ def score(
     code = worst_code([result.exit_code for result in results.values()])
     documents = {name: result.as_dict() for name, result in results.items()}
     facts = {"exit_code": code, "presets": documents}
-    if len(names) == 1:
-        facts = documents[names[0]]
-    lines = []
+    if is_alone:
+        (facts,) = documents.values()
+    if not as_json:
+        for result in results.values():
+            _warn_of_failures(result.summary)
+    has_protocol = any(choice.protocol for choice in chosen.values())
+    show(as_json, facts, *_result_lines(results, has_protocol))
+    raise typer.Exit(code)
+
+
+def _result_lines(results: Mapping[str, ScoreResult], has_protocol: bool) -> list[Any]:
+    """Return where the reports are, of a single preset below the first screen of its run; then the
+    scores of several presets, or of a protocol, side by side.
+    """
+    lines: list[Any] = []
     for result in results.values():
         run = read_run(result.root)
-        if len(names) == 1 and any(rollout.ok for rollout in run.rollouts):
+        if len(results) == 1 and any(rollout.ok for rollout in run.rollouts):
             lines += first_screen(run)
         lines += report_lines(result.root)
-    if len(names) > 1 or any(choice.protocol for choice in chosen.values()):
-        lines.append(render_presets({name: choice.summary for name, choice in results.items()}))
-    for result in () if as_json else results.values():
-        for cell in result.summary.failures.cells[:SHOWN_FAILURES]:
-            warn(*error_lines(to_json(cell.error)))
-        aggregation = result.summary.alpasim or {}
-        if aggregation.get("skipped"):
-            warn(f"AlpaSim's aggregation was not written: {aggregation['skipped']}")
-        if aggregation.get("error"):
-            warn(*error_lines(aggregation["error"]))
-    show(as_json, facts, *lines)
-    raise typer.Exit(code)
+    if len(results) > 1 or has_protocol:
+        lines.append(render_presets({name: result.summary for name, result in results.items()}))
+    return lines
+
+
+def _warn_of_failures(summary: Summary) -> None:
+    """Warn of rollouts that could not be scored, and of AlpaSim's tables that were not written."""
+    for cell in summary.failures.cells[:SHOWN_FAILURES]:
+        warn(*error_lines(to_json(cell.error)))
+    aggregation = summary.alpasim or {}
+    if aggregation.get("skipped"):
+        warn(f"AlpaSim's aggregation was not written: {aggregation['skipped']}")
+    if aggregation.get("error"):
+        warn(*error_lines(aggregation["error"]))
 
 
 def _settings(preset: presets.Preset, path: Path | None) -> EvalSettings | None:

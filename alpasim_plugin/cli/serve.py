@@ -3,6 +3,7 @@
 import logging
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -40,6 +41,52 @@ Exit codes: 0 stopped by a signal after running calls were answered; 2 wrong opt
 """
 
 
+@dataclass(frozen=True)
+class ServedRenderer:
+    """The renderer behind AlpaSim's renderer service."""
+
+    renderer: Annotated[str, Flag("Renderer or fixer as for `run`; identity hands frames on.")] = (
+        "onefixer"
+    )
+    scenes: Annotated[tuple[str, ...], Flag("Folder, scene file or shipped name; repeatable.")] = ()
+    upstream: Annotated[
+        str | None,
+        Flag(
+            "Renderer to stand in front of, with ?ca=FILE&token_file=FILE&image=png|as-asked.",
+            metavar="HOST:PORT",
+        ),
+    ] = None
+    set_: Annotated[
+        tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")
+    ] = ()
+    device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu"
+    history_mb: Annotated[
+        int,
+        Flag("Most memory for callers' histories or images, MiB.", min=16),
+    ] = 2048
+    mask: Annotated[
+        tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")
+    ] = ()
+    render_width: Annotated[
+        int | None, Flag("Render wider images at this width, pixels, and enlarge them.", min=16)
+    ] = None
+
+    def settings(self, expiry_s: float) -> Settings:
+        """Return the settings of the service, which forgets histories after ``expiry_s``."""
+        masks = dict(parted(item, "--mask") for item in self.mask)
+        return Settings(
+            renderer=self.renderer,
+            overrides=self.set_,
+            scenes=self.scenes,
+            upstream=None if self.upstream is None else Upstream.parse(self.upstream),
+            device=self.device,
+            history_bytes=self.history_mb * MIB,
+            expiry_s=expiry_s,
+            masks={camera: Path(file) for camera, file in masks.items()},
+            render_width=self.render_width,
+        )
+
+
 def serve(
     policy: Annotated[
         str | None, Flag("Serve this policy as a driver, instead of a renderer.", names="policy")
@@ -51,33 +98,7 @@ def serve(
             metavar="HOST:PORT",
         ),
     ] = None,
-    renderer: Annotated[
-        str, Flag("Renderer or fixer as for `run`; identity hands frames on.")
-    ] = "onefixer",
-    scenes: Annotated[
-        tuple[str, ...], Flag("Folder, scene file or shipped name; repeatable.")
-    ] = (),
-    upstream: Annotated[
-        str | None,
-        Flag(
-            "Renderer to stand in front of, with ?ca=FILE&token_file=FILE&image=png|as-asked.",
-            metavar="HOST:PORT",
-        ),
-    ] = None,
-    set_: Annotated[
-        tuple[str, ...], Flag("A setting of the fixer; repeatable.", "--set", metavar="KEY=VALUE")
-    ] = (),
-    device: Annotated[str, Flag("Where to compute: cpu, cuda or cuda:N.")] = "cpu",
-    history_mb: Annotated[
-        int,
-        Flag("Most memory for callers' histories or images, MiB.", min=16),
-    ] = 2048,
-    mask: Annotated[
-        tuple[str, ...], Flag("Grey image, white is trusted; repeatable.", metavar="CAMERA=FILE")
-    ] = (),
-    render_width: Annotated[
-        int | None, Flag("Render wider images at this width, pixels, and enlarge them.", min=16)
-    ] = None,
+    renderer: ServedRenderer = ServedRenderer(),
     host_policy: HostPolicy = HostPolicy(),
     as_json: Annotated[
         bool,
@@ -94,40 +115,28 @@ def serve(
     level = logging.INFO if debug else logging.WARNING
     logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s")
     if policy is not None:
-        _serve_policy(
-            policy,
-            listen or os.environ.get(ADDRESS, DRIVER_ADDRESS),
-            scenes,
-            host_policy,
-            history_mb * MIB,
-            as_json,
-        )
-        return
-    masks = dict(parted(item, "--mask") for item in mask)
-    settings = Settings(
-        renderer=renderer,
-        overrides=set_,
-        scenes=scenes,
-        upstream=None if upstream is None else Upstream.parse(upstream),
-        device=device,
-        history_bytes=history_mb * MIB,
-        expiry_s=host_policy.expiry_s,
-        masks={camera: Path(file) for camera, file in masks.items()},
-        render_width=render_width,
-    )
-    made = assemble(settings)
-    host = Host(
-        made.services, listen or RENDERER_ADDRESS, host_policy, CALLS_AT_A_TIME, made.expire
-    )
+        address = listen or os.environ.get(ADDRESS, DRIVER_ADDRESS)
+        budget = renderer.history_mb * MIB
+        _serve_policy(policy, address, renderer.scenes, host_policy, budget, as_json)
+    else:
+        _serve_renderer(renderer, listen or RENDERER_ADDRESS, host_policy, as_json)
+
+
+def _serve_renderer(
+    renderer: ServedRenderer, listen: str, host_policy: HostPolicy, as_json: bool
+) -> None:
+    """Serve AlpaSim's renderer service until a signal stops it, then print what was counted."""
+    made = assemble(renderer.settings(host_policy.expiry_s))
+    host = Host(made.services, listen, host_policy, CALLS_AT_A_TIME, made.expire)
     text = f"serving {', '.join(made.services)} at {host.address}: {made.spec.name}"
+    if renderer.upstream:
+        text += f" in front of {renderer.upstream}"
     facts = {
         "serving": list(made.services),
         "at": host.address,
-        "renderer": renderer,
-        "upstream": upstream,
+        "renderer": renderer.renderer,
+        "upstream": renderer.upstream,
     }
-    if upstream:
-        text += f" in front of {upstream}"
     try:
         _host(host, facts, text, host_policy, as_json)
     finally:
@@ -148,6 +157,7 @@ def _serve_policy(
     budget: int,
     as_json: bool,
 ) -> None:
+    """Serve a policy as AlpaSim's driver; ``budget``: bytes of callers' images that are kept."""
     spec = resolve("policy", policy)
 
     def make(scenario: Scenario) -> Policy:
