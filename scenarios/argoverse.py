@@ -149,24 +149,9 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             for raw in raw_lanes.values()
             for side in ("left", "right")
         ]
-        lanes = {}
-        for key, raw in raw_lanes.items():
-            location = f"{path}, lane {key}"
-            left = _line(files, location, raw, "left_lane_boundary", origin)
-            right = _line(files, location, raw, "right_lane_boundary", origin)
-            lanes[str(key)] = Lane(
-                lane_id=str(key),
-                centre=centre_line(left, right),
-                left=left,
-                right=right,
-                kind=KINDS[raw["lane_type"]],
-                successors=tuple(str(i) for i in raw.get("successors", ())),
-                left_neighbour=str(raw.get("left_neighbor_id")),
-                right_neighbour=str(raw.get("right_neighbor_id")),
-                left_mark_type=MARK_TYPES.get(str(raw.get("left_lane_mark_type")), "unknown"),
-                right_mark_type=MARK_TYPES.get(str(raw.get("right_lane_mark_type")), "unknown"),
-                is_intersection=bool(raw.get("is_intersection")),
-            )
+        lanes = {
+            str(key): _lane(files, path, str(key), raw, origin) for key, raw in raw_lanes.items()
+        }
         areas = tuple(
             _closed(_line(files, f"{path}, drivable area {key}", raw, "area_boundary", origin))
             for key, raw in raw_areas.items()
@@ -201,6 +186,25 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         for mark, count in sorted(strange.items())
     ]
     return lane_map, tuple(notes)
+
+
+def _lane(files: SourceFiles, path: Path, key: str, raw: JsonObject, origin: F64) -> Lane:
+    location = f"{path}, lane {key}"
+    left = _line(files, location, raw, "left_lane_boundary", origin)
+    right = _line(files, location, raw, "right_lane_boundary", origin)
+    return Lane(
+        lane_id=key,
+        centre=centre_line(left, right),
+        left=left,
+        right=right,
+        kind=KINDS[raw["lane_type"]],
+        successors=tuple(str(i) for i in raw.get("successors", ())),
+        left_neighbour=str(raw.get("left_neighbor_id")),
+        right_neighbour=str(raw.get("right_neighbor_id")),
+        left_mark_type=MARK_TYPES.get(str(raw.get("left_lane_mark_type")), "unknown"),
+        right_mark_type=MARK_TYPES.get(str(raw.get("right_lane_mark_type")), "unknown"),
+        is_intersection=bool(raw.get("is_intersection")),
+    )
 
 
 def read_ground(
@@ -373,19 +377,12 @@ def read_actors(
     others = np.nonzero(category != EGO_CATEGORY)[0]
     if len(others) == 0:
         return (), (NOBODY,)
-    row = np.minimum(np.searchsorted(poses.t_ns, t_ns), len(poses.t_ns) - 1)
-    lost = poses.t_ns[row] != t_ns
-    if lost.any():
-        raise InputError(
-            f"{path}: a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time",
-            "use annotations and poses of the same log",
-        )
+    T_local_ego = _poses_at(poses, t_ns, path, origin)
     quat = _columns(table, POSE[:4])
     unlike = np.abs(np.linalg.norm(quat, axis=1) - 1) > 1e-2
     if unlike[others].any():
         fault = f"a quaternion that is not of length 1 in row {int(np.argmax(unlike))}"
         raise InputError(f"{path}: {fault}", "give unit quaternions")
-    T_local_ego = se3(poses.xyz[row] - origin, poses.quat[row])
     T_local_box = T_local_ego @ se3(_columns(table, POSE[4:]), quat)
     xyz = T_local_box[:, :3, 3].copy()
     turns = quat_from_matrix(T_local_box[:, :3, :3])
@@ -416,6 +413,22 @@ def read_actors(
     if split:
         notes.append(f"{split} tracks have holes longer than 0.5 s and were split")
     return tuple(actors), tuple(notes)
+
+
+def _poses_at(poses: EgoPoses, t_ns: I64, path: Path, origin: F64) -> F64:
+    """Return the ego's poses ``(N, 4, 4)`` around the origin at the times of sweeps.
+
+    Raises:
+        InputError: There is no pose at exactly such a time.
+    """
+    row = np.minimum(np.searchsorted(poses.t_ns, t_ns), len(poses.t_ns) - 1)
+    lost = poses.t_ns[row] != t_ns
+    if lost.any():
+        raise InputError(
+            f"{path}: a sweep at {int(t_ns[lost][0])} ns without an ego pose at that time",
+            "use annotations and poses of the same log",
+        )
+    return se3(poses.xyz[row] - origin, poses.quat[row])
 
 
 def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:

@@ -112,13 +112,46 @@ def _focal_px(m: CameraModel) -> float:
     return 0.5 * m.width / (float(half) * bent)
 
 
+def _from_calibration(path: Path) -> tuple[CameraSpec, ...]:
+    """Read the cameras of a calibration, in the format that its file or folder has."""
+    if os.path.isdir(path / "calibration"):
+        from scenarios.argoverse import read_calibration
+
+        return read_calibration(path)
+    if path.suffix == ".usdz":
+        from scenarios.ftheta import rig_cameras
+
+        return rig_cameras(path)
+    if path.suffix == ".json":
+        from alpasim_plugin.cameras.transforms import read_transforms
+
+        return read_transforms(path)
+    raise InputError(
+        f"{path}: {contents(path)}, no calibration that is known here",
+        "give an Argoverse 2 log, which has a folder calibration, a .usdz of AlpaSim, or a transforms.json",
+    )
+
+
+def _chosen(
+    draft: SceneDraft, cameras: Sequence[CameraSpec], names: Sequence[str]
+) -> tuple[CameraSpec, ...]:
+    """Return the cameras of a calibration that a scenario names, in its order."""
+    cameras_by_name = {camera.name: camera for camera in cameras}
+    for i, name in enumerate(names):
+        if name not in cameras_by_name:
+            raise draft.document.error(
+                ("cameras", "names", i),
+                f"no camera {name!r} in this calibration",
+                f"choose from {', '.join(cameras_by_name)}",
+            )
+    return tuple(cameras_by_name[name] for name in names)
+
+
 def _from_set(draft: SceneDraft, camera_set: CameraSet) -> tuple[CameraSpec, ...]:
     if camera_set.rig is not None:
         document = load_yaml(RIGS_FILE)
-        rig = validate(Rigs, Document({"rigs": document.data}, {}, str(RIGS_FILE))).rigs[
-            camera_set.rig
-        ]
-        cameras = tuple(camera_spec(model) for model in rig)
+        rigs = validate(Rigs, Document({"rigs": document.data}, {}, str(RIGS_FILE))).rigs
+        cameras = tuple(camera_spec(model) for model in rigs[camera_set.rig])
     else:
         assert camera_set.from_ is not None, "a set has a rig or a file"
         path = draft.document.folder_of(("cameras", "from")) / camera_set.from_
@@ -129,33 +162,9 @@ def _from_set(draft: SceneDraft, camera_set: CameraSet) -> tuple[CameraSpec, ...
                 "correct the path; it is relative to the scenario file",
             )
         with draft.at("cameras", "from"):
-            if os.path.isdir(path / "calibration"):
-                from scenarios.argoverse import read_calibration
-
-                cameras = read_calibration(path)
-            elif path.suffix == ".usdz":
-                from scenarios.ftheta import rig_cameras
-
-                cameras = rig_cameras(path)
-            elif path.suffix == ".json":
-                from alpasim_plugin.cameras.transforms import read_transforms
-
-                cameras = read_transforms(path)
-            else:
-                raise InputError(
-                    f"{path}: {contents(path)}, no calibration that is known here",
-                    "give an Argoverse 2 log, which has a folder calibration, a .usdz of AlpaSim, or a transforms.json",
-                )
+            cameras = _from_calibration(path)
         if camera_set.names:
-            cameras_by_name = {camera.name: camera for camera in cameras}
-            for i, name in enumerate(camera_set.names):
-                if name not in cameras_by_name:
-                    raise draft.document.error(
-                        ("cameras", "names", i),
-                        f"no camera {name!r} in this calibration",
-                        f"choose from {', '.join(cameras_by_name)}",
-                    )
-            cameras = tuple(cameras_by_name[name] for name in camera_set.names)
+            cameras = _chosen(draft, cameras, camera_set.names)
     if camera_set.width is not None:
         width = camera_set.width
         cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)

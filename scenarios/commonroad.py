@@ -6,6 +6,7 @@ recorded vehicle takes that role, so that there is a human drive to compare with
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -85,40 +86,54 @@ def read_obstacles(path: Path, root: Element) -> tuple[list[Obstacle], list[str]
     """
     obstacles: dict[str, Obstacle] = {}
     skipped: Counter[str] = Counter()
-    for element in (e for e in root if e.tag in ("obstacle", "staticObstacle", "dynamicObstacle")):
+    for element in root:
+        if element.tag not in ("obstacle", "staticObstacle", "dynamicObstacle"):
+            continue
         key = str(element.get("id"))
         static = element.tag == "staticObstacle" or element.findtext("role") == "static"
         states = [*element.findall("initialState"), *element.findall("trajectory/state")]
-        exact = ("position/point", "orientation/exact")
-        if not states or any(state.find(tag) is None for state in states for tag in exact):
+        if not states or not all(map(_is_exact, states)):
             skipped["have states without an exact position and orientation"] += 1
             continue
         if element.find("occupancySet") is not None or (static and len(states) > 1):
             skipped["are predicted as occupied areas, not as states"] += 1
             continue
-        with parsing(f"{path}, obstacle {key}", "correct the obstacle"):
+        location = f"{path}, obstacle {key}"
+        with parsing(location, "correct the obstacle"):
             if key in obstacles:
                 raise ValueError("its id stands twice")
-            (length, width), offset, turn = _bounding_box(element)
-            label = LABELS.get(str(element.findtext("type")), "other")
-            yaw = np.array([number(state, "orientation/exact") for state in states])
-            centre = np.array([point(place) for place in element.iterfind(".//position/point")])
-            c = np.cos(yaw)
-            s = np.sin(yaw)
-            centre[:, 0] += c * offset[0] - s * offset[1]
-            centre[:, 1] += s * offset[0] + c * offset[1]
-            times = [number(state, "time/exact") for state in states]
-            for time in times:
-                STEP.check(time, f"{path}, obstacle {key}", "time step")
-            steps = np.rint(times).astype(np.int64)
-            box = Box(length, width, HEIGHTS_M[label])
-            obstacles[key] = Obstacle(key, label, static, box, steps, centre, yaw + turn)
+            obstacles[key] = _obstacle(element, key, static, states, location)
     notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
     for tag in ("environmentObstacle", "phantomObstacle"):
         count = len(root.findall(tag))
         if count:
             notes.append(f"{count} {tag} elements were left out")
     return list(obstacles.values()), notes
+
+
+def _is_exact(state: Element) -> bool:
+    """Tell whether a state has a position and an orientation, not ranges of them."""
+    return all(state.find(tag) is not None for tag in ("position/point", "orientation/exact"))
+
+
+def _obstacle(
+    element: Element, key: str, static: bool, states: list[Element], location: str
+) -> Obstacle:
+    """Return an obstacle with its states; `ValueError` where a number is missing."""
+    (length, width), offset, turn = _bounding_box(element)
+    label = LABELS.get(str(element.findtext("type")), "other")
+    yaw = np.array([number(state, "orientation/exact") for state in states])
+    centre = np.array([point(place) for place in element.iterfind(".//position/point")])
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    centre[:, 0] += c * offset[0] - s * offset[1]
+    centre[:, 1] += s * offset[0] + c * offset[1]
+    times = [number(state, "time/exact") for state in states]
+    for time in times:
+        STEP.check(time, location, "time step")
+    steps = np.rint(times).astype(np.int64)
+    box = Box(length, width, HEIGHTS_M[label])
+    return Obstacle(key, label, static, box, steps, centre, yaw + turn)
 
 
 def _bounding_box(
@@ -187,14 +202,7 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
     file = Path(path)
     files = SourceFiles()
     root = files.read_xml(file)
-    version = root.get("commonRoadVersion")
-    if root.tag != "commonRoad" or version not in VERSIONS:
-        fault = f"root element {root.tag!r}, version {version!r}"
-        do_this = f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
-        raise InputError(f"{file}: {fault}", do_this)
-    with parsing(file, "give the time step in seconds"):
-        dt_s = float(root.get("timeStepSize", ""))
-    TIME_STEP_S.check(dt_s, file, "timeStepSize")
+    dt_s = _time_step_s(file, root)
     obstacles, obstacle_notes = read_obstacles(file, root)
     if not obstacles:
         raise InputError(
@@ -208,30 +216,13 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         near(f"{file}, obstacle {obstacle.obstacle_id}", obstacle.centre)
     lane_map, map_notes = read_lanelets(file, root, origin)
     chosen, why = _choose_ego(file, obstacles, ego)
-    # The file has sizes and no axles: the default chassis in proportion.
-    scale = chosen.box.length_m / DEFAULT.box.length_m
-    vehicle = Vehicle(
-        chosen.box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale
-    )
+    vehicle = _vehicle(chosen.box)
     centre_log = chosen.trajectory(file, dt_s)
     if len(centre_log) < 2:
         raise InputError(
             f"{file}, obstacle {chosen.obstacle_id}: 1 state", "choose an ego with a trajectory"
         )
     T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -chosen.box.height_m / 2)
-    steps = np.concatenate([obstacle.steps for obstacle in obstacles if not obstacle.static])
-    ends_us = np.round(np.array([steps.min(), steps.max()]) * dt_s * 1e6).astype(np.int64)
-    actors = []
-    for obstacle in obstacles:
-        track = obstacle.trajectory(file, dt_s)
-        if obstacle.static:  # it is there for the whole recording
-            xyz, quat = (np.repeat(column, 2, axis=0) for column in (track.xyz, track.quat))
-            still = Trajectory(ends_us, xyz, quat)
-            actors.append(
-                Actor(obstacle.obstacle_id, obstacle.label, obstacle.box, still, is_static=True)
-            )
-        elif obstacle is not chosen:
-            actors += actors_of_track(obstacle.obstacle_id, obstacle.label, obstacle.box, track)
     notes = (
         why,
         f"ego box {chosen.box.length_m} x {chosen.box.width_m} m from the file; rear axle assumed {vehicle.rear_axle_to_centre_m:.2f} m "
@@ -249,12 +240,51 @@ def read_commonroad(path: str | Path, ego: str | None = None) -> RecordedLog:
         ground=ground_of(lane_map, chosen.centre),
         ego_log=offset_trajectory(centre_log, T_centre_rig),
         vehicle=vehicle,
-        actors=tuple(actors),
+        actors=tuple(_actors(file, obstacles, chosen, dt_s)),
         cameras=(),
         world_origin=(float(origin[0]), float(origin[1]), 0.0),
         content_hash=files.content_hash,
         notes=notes,
     )
+
+
+def _time_step_s(path: Path, root: Element) -> float:
+    """Return the length of a time step, seconds.
+
+    Raises:
+        InputError: The document is no CommonRoad scenario, or it has no time step.
+    """
+    version = root.get("commonRoadVersion")
+    if root.tag != "commonRoad" or version not in VERSIONS:
+        fault = f"root element {root.tag!r}, version {version!r}"
+        do_this = f"give a CommonRoad XML file of version {' or '.join(VERSIONS)}"
+        raise InputError(f"{path}: {fault}", do_this)
+    with parsing(path, "give the time step in seconds"):
+        dt_s = float(root.get("timeStepSize", ""))
+    TIME_STEP_S.check(dt_s, path, "timeStepSize")
+    return dt_s
+
+
+def _vehicle(box: Box) -> Vehicle:
+    """Return the default chassis in proportion to a box: the file has sizes and no axles."""
+    scale = box.length_m / DEFAULT.box.length_m
+    return Vehicle(box, DEFAULT.rear_axle_to_centre_m * scale, DEFAULT.wheelbase_m * scale)
+
+
+def _actors(path: Path, obstacles: Sequence[Obstacle], ego: Obstacle, dt_s: float) -> list[Actor]:
+    """Return the obstacles other than the ego; static ones are there for the whole recording."""
+    steps = np.concatenate([obstacle.steps for obstacle in obstacles if not obstacle.static])
+    ends_us = np.round(np.array([steps.min(), steps.max()]) * dt_s * 1e6).astype(np.int64)
+    actors = []
+    for obstacle in obstacles:
+        name, label, box = obstacle.obstacle_id, obstacle.label, obstacle.box
+        track = obstacle.trajectory(path, dt_s)
+        if obstacle.static:
+            xyz, quat = (np.repeat(column, 2, axis=0) for column in (track.xyz, track.quat))
+            actors.append(Actor(name, label, box, Trajectory(ends_us, xyz, quat), is_static=True))
+        elif obstacle is not ego:
+            actors += actors_of_track(name, label, box, track)
+    return actors
 
 
 def _choose_ego(path: Path, obstacles: list[Obstacle], ego: str | None) -> tuple[Obstacle, str]:

@@ -128,19 +128,7 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
         InputError: No such lane there.
     """
     if isinstance(lane, str):
-        lanes = road.lane_map.lanes
-        if lane not in lanes:
-            raise InputError(
-                f"lane {lane!r}: the road's lanes are {', '.join(sorted(lanes))}",
-                "choose one of them",
-            )
-        out = [lane]
-        while lanes[out[-1]].successors and len(out) < 100:
-            following = lanes[out[-1]].successors[0]
-            if following in out:
-                break
-            out.append(following)
-        return tuple(out)
+        return _first_successors(road, lane)
     i = ego_path.stretch_at(at_s_m)
     stretch = road.stretches[i]
     ids = []
@@ -160,6 +148,23 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
             "choose one that exists",
         )
     return tuple(ids)
+
+
+def _first_successors(road: Road, lane_id: str) -> tuple[str, ...]:
+    """Return a lane and the lanes behind it, each time the first successor, until one comes again."""
+    lanes = road.lane_map.lanes
+    if lane_id not in lanes:
+        raise InputError(
+            f"lane {lane_id!r}: the road's lanes are {', '.join(sorted(lanes))}",
+            "choose one of them",
+        )
+    chain = [lane_id]
+    while lanes[chain[-1]].successors and len(chain) < 100:
+        following = lanes[chain[-1]].successors[0]
+        if following in chain:
+            break
+        chain.append(following)
+    return tuple(chain)
 
 
 def _back(road: Road, stretch: int, lane: int) -> list[tuple[str, int]]:

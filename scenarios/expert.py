@@ -228,41 +228,28 @@ def drive(
         _Car(follower, lights_on(follower.path, signals), lights_on(follower.path, give_way))
         for follower in followers
     ]
-    lines = Lines([car.f.path for car in cars]) if cars else None
-    half_widths = np.array([car.f.box.width_m / 2 for car in cars])
+    lines = Lines([follower.path for follower in followers]) if cars else None
     log_s = [expert.s]
-    log_t = [0]
-    sub_s = LOG_STEP_US * 1e-6
     for t in range(0, end_us, DECISION_US):
         ahead = _predicted(table, cars, lines, t)
         moving = ahead.now()
-        wanted = expert.decide(moving, ahead, t)
+        target = expert.decide(moving, ahead, t)
         if lines is not None:
             everybody = concatenate([table.standing, expert.bodies(), moving])
-            own_row = np.full(len(cars), -1)
-            driving = np.flatnonzero(ahead.present[0, len(table.boxes) :])
-            own_row[driving] = np.arange(len(everybody.xy) - len(driving), len(everybody.xy))
-            fronts = np.array([car.front_s for car in cars])
-            horizons = np.full(len(cars), FOLLOWED_M)
-            leaders = find_leaders(
-                lines, np.arange(len(cars)), fronts, half_widths, everybody, horizons, own_row
-            )
-            for car, leader, row in zip(cars, leaders, own_row.tolist(), strict=True):
-                car.decide(leader, everybody, row, t)
+            driving = ahead.present[0, len(table.boxes) :]
+            _let_followers_decide(cars, lines, everybody, driving, t)
         for _ in range(DECISION_US // LOG_STEP_US):
-            expert.advance(wanted, sub_s)
+            expert.advance(target, LOG_STEP_US * 1e-6)
             log_s.append(expert.s)
-            log_t.append(log_t[-1] + LOG_STEP_US)
         for car in cars:
             car.advance(DECISION_US * 1e-6)
         if expert.front_s + 1.0 > path.length_m:
             break
-    t_us = np.array(log_t, dtype=np.int64)
-    times = t_us[:: DECISION_US // LOG_STEP_US]
+    t_us = LOG_STEP_US * np.arange(len(log_s), dtype=np.int64)
     keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
     xyz, yaw = path.at(np.array(log_s)[keep])
     ego_log = Trajectory(t_us[keep], xyz, quat_from_yaw(yaw))
-    return ego_log, tuple(car.driven(times) for car in cars)
+    return ego_log, tuple(car.driven(t_us[:: DECISION_US // LOG_STEP_US]) for car in cars)
 
 
 class _Expert:
@@ -376,6 +363,34 @@ class _Car:
         f = self.f
         track = track_on_path(f.path, times, s_m, f.box, f.offset_m)
         return Actor(f.actor_id, f.label, f.box, track, behaviour=Behaviour("idm", f.params))
+
+
+def _let_followers_decide(
+    cars: Sequence[_Car], lines: Lines, everybody: Bodies, driving: Bool, t_us: int
+) -> None:
+    """Let each follower decide by its leader.
+
+    Args:
+        cars: The followers.
+        lines: The paths of the followers.
+        everybody: All bodies; those of the followers that drive are the last.
+        driving: ``(F,)`` which followers drive.
+        t_us: Now.
+    """
+    row_of_car = np.full(len(cars), -1)
+    n_driving = int(driving.sum())
+    row_of_car[driving] = np.arange(len(everybody.xy) - n_driving, len(everybody.xy))
+    leaders = find_leaders(
+        lines,
+        np.arange(len(cars)),
+        np.array([car.front_s for car in cars]),
+        np.array([car.f.box.width_m / 2 for car in cars]),
+        everybody,
+        np.full(len(cars), FOLLOWED_M),
+        row_of_car,
+    )
+    for car, leader, row in zip(cars, leaders, row_of_car.tolist(), strict=True):
+        car.decide(leader, everybody, row, t_us)
 
 
 def _predicted(

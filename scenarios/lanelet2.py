@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -184,52 +184,68 @@ class Osm:
         Metres ``local_x``, ``local_y`` go before latitude and longitude, which are projected onto
         the plane that touches the earth in the middle of the map.
         """
-        local = {key for key, place in places.items() if "local_x" in place or "local_y" in place}
-        if local and len(local) < len(places):
-            key = next(key for key in places if key not in local)
-            raise InputError(
-                f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
-                "give them to all nodes, or to none",
-            )
-        half = [
-            key for key in places if key in local and not {"local_x", "local_y"} <= {*places[key]}
-        ]
-        if half:
-            raise InputError(
-                f"{self.path}, node {half[0]}: one of local_x and local_y without the other",
-                "give both in metres",
-            )
-        if not local and any("lat" not in place or "lon" not in place for place in places.values()):
-            key = next(key for key, place in places.items() if not {"lat", "lon"} <= {*place})
-            raise InputError(
-                f"{self.path}, node {key}: neither lat and lon nor the tags local_x and local_y",
-                "convert the map; metres in attributes x and y (INTERACTION) are not read",
-            )
-        high = all("ele" in place for place in places.values())
-        axes = [*(("local_x", "local_y") if local else ("lon", "lat")), *(["ele"] if high else [])]
-        most = (1e9, 1e9, 1e9) if local else (180.0, 90.0, 1e9)
+        is_local = self._has_local_places(places)
+        axes = ["local_x", "local_y"] if is_local else ["lon", "lat"]
+        has_height = all("ele" in place for place in places.values())
+        if has_height:
+            axes.append("ele")
+        most = (1e9, 1e9, 1e9) if is_local else (180.0, 90.0, 1e9)
         table = np.zeros((len(places), 3))
         for row, (key, place) in zip(table, places.items(), strict=True):
             with parsing(f"{self.path}, node {key}", "give numbers, degrees or metres"):
                 row[: len(axes)] = [float(place[axis]) for axis in axes]
                 if not (np.abs(row) <= most).all():
                     raise ValueError(f"no place on the earth: {row.tolist()}")
-        xy = table[:, :2]
-        z = table[:, 2]
-        notes = [] if high else ["not all points have a height (ele): the map is level"]
-        if local:
-            shift = np.round(xy[0])
+        notes = [] if has_height else ["not all points have a height (ele): the map is level"]
+        if is_local:
+            shift = np.round(table[0, :2])
             origin = (float(shift[0]), float(shift[1]), 0.0)
-            points = np.column_stack([xy - shift, z])
+            points = table - np.array(origin)
         else:
             origin = (0.0, 0.0, 0.0)
-            lon, lat = np.round((xy.min(axis=0) + xy.max(axis=0)) / 2, 3) if len(xy) else (0.0, 0.0)
-            earth = earth_xyz(xy[:, 1], xy[:, 0], np.zeros(len(xy)))
-            points = transform_points(T_enu_earth(lat, lon, 0.0), earth)
-            points[:, 2] = z
+            points, lat, lon = _in_tangent_plane(table)
             notes.append(f"origin at latitude {lat:.3f}, longitude {lon:.3f}; x east, y north")
         near(self.path, points)
         return dict(zip(places, points, strict=True)), origin, tuple(notes)
+
+    def _has_local_places(self, places: Mapping[str, Mapping[str, str]]) -> bool:
+        """Tell whether the nodes have places in metres.
+
+        Raises:
+            InputError: Some nodes have and some have not, or a node has no place at all.
+        """
+        local = {key for key, place in places.items() if "local_x" in place or "local_y" in place}
+        for key, place in places.items():
+            if local and key not in local:
+                raise InputError(
+                    f"{self.path}, node {key}: no local_x and local_y, which {len(local)} of {len(places)} nodes have",
+                    "give them to all nodes, or to none",
+                )
+            if local and not {"local_x", "local_y"} <= {*place}:
+                raise InputError(
+                    f"{self.path}, node {key}: one of local_x and local_y without the other",
+                    "give both in metres",
+                )
+            if not local and not {"lat", "lon"} <= {*place}:
+                raise InputError(
+                    f"{self.path}, node {key}: neither lat and lon nor the tags local_x and local_y",
+                    "convert the map; metres in attributes x and y (INTERACTION) are not read",
+                )
+        return bool(local)
+
+
+def _in_tangent_plane(table: F64) -> tuple[F64, float, float]:
+    """Project longitude and latitude ``(N, 3)`` (degrees; heights, metres, stay) onto the plane that
+    touches the earth in their middle: east, north, and latitude and longitude of that middle.
+    """
+    lon_lat = table[:, :2]
+    lon, lat = 0.0, 0.0
+    if len(table):
+        lon, lat = np.round((lon_lat.min(axis=0) + lon_lat.max(axis=0)) / 2, 3)
+    earth = earth_xyz(table[:, 1], table[:, 0], np.zeros(len(table)))
+    points = transform_points(T_enu_earth(lat, lon, 0.0), earth)
+    points[:, 2] = table[:, 2]
+    return points, lat, lon
 
 
 @dataclass(frozen=True)
@@ -244,6 +260,25 @@ class Bound:
         return Bound(self.way, self.nodes[::-1])
 
 
+@dataclass
+class Lanelets:
+    """The lanelets of a map as they are read.
+
+    Attributes:
+        lanes: The lanes by id.
+        bounds: Left and right bound of each lane.
+        crosswalks: Outline of each ``(N, 3)``, metres.
+        left_out: How many lanelets of each type are no lanes.
+        reserved: How many lanes of each type are not for cars.
+    """
+
+    lanes: dict[str, Lane] = field(default_factory=dict)
+    bounds: dict[str, tuple[Bound, Bound]] = field(default_factory=dict)
+    crosswalks: list[F64] = field(default_factory=list)
+    left_out: Counter[str] = field(default_factory=Counter)
+    reserved: Counter[str] = field(default_factory=Counter)
+
+
 def read_street(files: SourceFiles, path: Path) -> StreetMap:
     """Read a map for a drive on it.
 
@@ -252,69 +287,27 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
             lanelet is for vehicles.
     """
     osm = Osm(files, path)
-    left_out: Counter[str] = Counter()
-    reserved: Counter[str] = Counter()
-    crosswalks: list[F64] = []
-    bounds: dict[str, tuple[Bound, Bound]] = {}
-    lanes: dict[str, Lane] = {}
     limits, unread = _limits(osm)
-    for key, lanelet in osm.lanelets.items():
-        left, right = _bounds(osm, key, lanelet)
-        subtype = lanelet.tags.get("subtype", "road")
-        named = _participants(lanelet)
-        kind = _kind(subtype, named)
-        if subtype == "crosswalk":
-            crosswalks.append(osm.line((*left.nodes, *right.nodes[::-1], left.nodes[0])))
-        users = ", ".join(sorted(name for name, may in named.items() if may))
-        if kind is None:
-            left_out[f"{subtype} for {users}" if users else subtype] += 1
-            continue
-        if kind != "vehicle" and named:
-            reserved[f"{subtype} are for {users} and not for cars"] += 1
-        bounds[key] = left, right
-        lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
-    if not any(lane.kind == "vehicle" for lane in lanes.values()):
+    lanelets = _read_lanelets(osm, limits)
+    if not any(lane.kind == "vehicle" for lane in lanelets.lanes.values()):
         raise InputError(f"{path}: a map without a lanelet for vehicles", "use one with a road")
-    lanes = mark_intersections(_linked(lanes, bounds))
-    for key in [key for key in lanes if osm.lanelets[key].tags.get("one_way") in ("no", "false")]:
-        left, right = bounds[key]
-        bounds[f"-{key}"] = right.turned(), left.turned()
-        back = _lane(osm, f"-{key}", lanes[key].kind, *bounds[f"-{key}"], limits.get(key))
-        lanes[f"-{key}"] = replace(back, is_intersection=lanes[key].is_intersection)
-    lanes = _linked(lanes, bounds)
+    _add_opposite_lanes(osm, lanelets, limits)
+    lanes = _linked(lanelets.lanes, lanelets.bounds)
     lengths = {key: float(arc_lengths(lane.centre)[-1]) for key, lane in lanes.items()}
 
     def spots(name: str, s_m: float) -> list[Spot]:
         stations = {name: s_m, f"-{name}": lengths[name] - s_m}
         return [Spot(key, at_m) for key, at_m in stations.items() if key in lanes]
 
-    notes = [f"lanelets of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
-    notes += [f"{n} lanelets of type {text}" for text, n in sorted(reserved.items())]
-    without = sum(
-        lane.kind == "vehicle" and lane.speed_limit_mps is None for lane in lanes.values()
-    )
-    if without:
-        notes.append(
-            f"lanes for cars without a speed limit: {without}; limits by location and type are not applied"
-        )
-    rules = Counter(rule.tags.get("subtype", "") for rule in osm.rules.values())
-    notes += [
-        f"regulatory elements of type {subtype or 'unknown'} are not read: {n}"
-        for subtype, n in sorted(rules.items())
-        if subtype not in RULES
-    ]
-    if unread:
-        notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
     heads = _heads(osm, lanes)
-    areas = len(osm.relations("multipolygon"))
-    notes += [f"areas (multipolygon) left out: {areas}"] if areas else []
+    notes = [*_lane_notes(lanelets, lanes), *_rule_notes(osm, unread)]
     return StreetMap(
         lanes,
         LaneMap(
             {},
-            crosswalks=tuple(crosswalks),
+            crosswalks=tuple(lanelets.crosswalks),
             stop_lines=tuple(osm.line(osm.nodes(way)) for way in osm.ways("stop_line")),
-            poles=tuple(_post(one.signal) for one in heads if one.signal.head is not None),
+            poles=tuple(_post(head.signal) for head in heads if head.signal.head is not None),
             signs=tuple(_sign(osm, way) for way in osm.ways("traffic_sign")),
         ),
         heads,
@@ -324,6 +317,74 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         osm.origin,
         (*osm.notes, *notes, *LANELET2.notes(_met(osm))),
     )
+
+
+def _read_lanelets(osm: Osm, limits: Mapping[str, float | None]) -> Lanelets:
+    """Return the lanelets of a map, each in its own direction, without what follows them."""
+    lanelets = Lanelets()
+    for key, lanelet in osm.lanelets.items():
+        left, right = _bounds(osm, key, lanelet)
+        subtype = lanelet.tags.get("subtype", "road")
+        if subtype == "crosswalk":
+            outline = (*left.nodes, *right.nodes[::-1], left.nodes[0])
+            lanelets.crosswalks.append(osm.line(outline))
+        participants = _participants(lanelet)
+        users = ", ".join(sorted(name for name, may in participants.items() if may))
+        kind = _kind(subtype, participants)
+        if kind is None:
+            lanelets.left_out[f"{subtype} for {users}" if users else subtype] += 1
+            continue
+        if kind != "vehicle" and participants:
+            lanelets.reserved[f"{subtype} are for {users} and not for cars"] += 1
+        lanelets.bounds[key] = left, right
+        lanelets.lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
+    return lanelets
+
+
+def _add_opposite_lanes(osm: Osm, lanelets: Lanelets, limits: Mapping[str, float | None]) -> None:
+    """Mark the lanes of intersections, and add a lane ``-ID`` to each lanelet that is driven both
+    ways.
+    """
+    bounds = lanelets.bounds
+    lanelets.lanes = mark_intersections(_linked(lanelets.lanes, bounds))
+    for key, lane in [*lanelets.lanes.items()]:
+        if osm.lanelets[key].tags.get("one_way") in ("no", "false"):
+            left, right = bounds[key]
+            bounds[f"-{key}"] = right.turned(), left.turned()
+            back = _lane(osm, f"-{key}", lane.kind, *bounds[f"-{key}"], limits.get(key))
+            lanelets.lanes[f"-{key}"] = replace(back, is_intersection=lane.is_intersection)
+
+
+def _lane_notes(lanelets: Lanelets, lanes: Mapping[str, Lane]) -> list[str]:
+    """Return notes on lanelets that are no lanes, or lanes without a limit."""
+    notes = [
+        f"lanelets of type {kind} left out: {n}" for kind, n in sorted(lanelets.left_out.items())
+    ]
+    notes += [f"{n} lanelets of type {text}" for text, n in sorted(lanelets.reserved.items())]
+    without = sum(
+        lane.kind == "vehicle" and lane.speed_limit_mps is None for lane in lanes.values()
+    )
+    if without:
+        notes.append(
+            f"lanes for cars without a speed limit: {without}; limits by location and type are not applied"
+        )
+    return notes
+
+
+def _rule_notes(osm: Osm, unread: Sequence[str]) -> list[str]:
+    """Return notes on regulatory elements, ``unread`` limits and areas that are left out."""
+    rules = Counter(rule.tags.get("subtype", "") for rule in osm.rules.values())
+    notes = [
+        f"regulatory elements of type {subtype or 'unknown'} are not read: {n}"
+        for subtype, n in sorted(rules.items())
+        if subtype not in RULES
+    ]
+    if unread:
+        notes.append(f"{len(unread)} speed limits without a number: {some_of(unread)}")
+    areas = len(osm.relations("multipolygon"))
+    if areas:
+        notes.append(f"areas (multipolygon) left out: {areas}")
+    return notes
 
 
 def _met(osm: Osm) -> Iterator[str]:

@@ -16,13 +16,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.path_end import remaining
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F64, Bool, LaneMap, Route, Signal, Vehicle
+from alpasim_plugin.core.types import F64, Actor, Bool, LaneMap, Route, Signal, Vehicle
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.build import TRACKED_EVERY, with_last
 from scenarios.ego_path import grid
-from scenarios.expert import drive
+from scenarios.expert import Follower, drive
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
 from scenarios.map_route import STATION_M, LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
@@ -59,12 +59,8 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     """
     spec = draft.spec
     assert spec.map is not None
-    kind, text = spec.map.source
-    path = draft.document.folder_of(("map", kind)) / text
     files = SourceFiles()
-    with parsing(path, "repair this map, or use another one"):
-        street = READERS[kind](files, path)
-    street, gap_notes = _without_gaps(street)
+    street, gap_notes = _without_gaps(_read_street(draft, spec.map, files))
     graph = LaneGraph(street.lanes)
     with draft.at("map", "route"):
         way = _way(draft, spec.map, graph, street)
@@ -73,39 +69,15 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     goal_m = graph.line(way).length_m - way.beyond_m
     way = graph.carried_on(way, AHEAD_M)
     line = graph.line(way)
-    lane_map = _around(street, line)
-    heads = [
-        head for head in street.heads if any(key in lane_map.lanes for key in head.signal.lanes)
-    ]
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-    lane_map = replace(
-        lane_map,
-        signals=_timed(heads, line, front_m, spec.ego.cruise_mps),
-        give_way=tuple(
-            signal
-            for signal in street.give_way
-            if any(key in lane_map.lanes for key in signal.lanes)
-        ),
+    lane_map, heads = _with_signals(
+        street, _around(street, line), line, front_m, spec.ego.cruise_mps
     )
     keep = line.s <= goal_m + front_m + 1.0
     driven = _inside_bends(
         Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep]), front_m
     )
-    duration_us = spec.timing.duration_us
-    end_us = round(LONGEST_S * 1e6)
-    if duration_us is not None:
-        end_us = spec.timing.start_us + spec.timing.start_time_offset_us + duration_us
-    rng = stream(draft.scene_id, spec.seed, "scenario/map/vehicles")
-    followers = place_followers(lane_map, way, line, spec.map.vehicles, rng)
-    walkers = place_walkers(
-        lane_map,
-        driven,
-        front_m,
-        spec.ego.cruise_mps,
-        spec.map.pedestrians,
-        grid(end_us),
-        stream(draft.scene_id, spec.seed, "scenario/map/pedestrians"),
-    )
+    followers, walkers = _traffic(draft, spec.map, lane_map, way, line, driven, front_m)
     ego_log, vehicles = drive(
         driven,
         0.0,
@@ -113,14 +85,14 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         spec.ego,
         walkers,
         followers,
-        end_us,
+        _end_us(draft),
         lane_map.signals,
         lane_map.give_way,
         graph.limits_mps(way, driven),
     )
     return RecordedLog(
         draft.scene_id,
-        kind,
+        spec.map.source[0],
         lane_map,
         ground_of(lane_map, ego_log.xyz),
         ego_log,
@@ -129,11 +101,65 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         (),
         street.origin,
         files.content_hash,
-        (*_said(way, goal_m, heads, len(followers)), *gap_notes, *street.notes),
+        (*_notes(way, goal_m, heads, len(followers)), *gap_notes, *street.notes),
         route=Route(line.xyz[::4], way.lane_ids),
         path_beyond=_up_to_goal(driven, driven.length_m - front_m - 1.0, ego_log.xyz),
         path_end="goal",
     )
+
+
+def _read_street(draft: SceneDraft, spec: MapSpec, files: SourceFiles) -> StreetMap:
+    kind, text = spec.source
+    path = draft.document.folder_of(("map", kind)) / text
+    with parsing(path, "repair this map, or use another one"):
+        return READERS[kind](files, path)
+
+
+def _end_us(draft: SceneDraft) -> int:
+    """Return the last time of the drive: the duration that the file states, or the longest."""
+    timing = draft.spec.timing
+    if timing.duration_us is None:
+        return round(LONGEST_S * 1e6)
+    return timing.start_us + timing.start_time_offset_us + timing.duration_us
+
+
+def _traffic(
+    draft: SceneDraft,
+    spec: MapSpec,
+    lane_map: LaneMap,
+    way: Way,
+    line: Path,
+    driven: Path,
+    front_m: float,
+) -> tuple[Sequence[Follower], Sequence[Actor]]:
+    """Return the drivers and the walkers around the route, at places that the seed draws.
+
+    Args:
+        draft: Scene and seed.
+        spec: How many of each.
+        lane_map: The map around the route.
+        way: The route.
+        line: Its line, on past the goal.
+        driven: The line of the rear axle up to the goal.
+        front_m: From the rear axle to the front of the ego.
+    """
+    followers = place_followers(
+        lane_map,
+        way,
+        line,
+        spec.vehicles,
+        stream(draft.scene_id, draft.spec.seed, "scenario/map/vehicles"),
+    )
+    walkers = place_walkers(
+        lane_map,
+        driven,
+        front_m,
+        draft.spec.ego.cruise_mps,
+        spec.pedestrians,
+        grid(_end_us(draft)),
+        stream(draft.scene_id, draft.spec.seed, "scenario/map/pedestrians"),
+    )
+    return followers, walkers
 
 
 def _without_gaps(street: StreetMap) -> tuple[StreetMap, tuple[str, ...]]:
@@ -250,6 +276,25 @@ def _around(street: StreetMap, line: Path) -> LaneMap:
     )
 
 
+def _with_signals(
+    street: StreetMap, lane_map: LaneMap, line: Path, front_m: float, cruise_mps: float
+) -> tuple[LaneMap, list[Head]]:
+    """Return the part of a map around the route with its lights and lines of give-way, and the heads
+    of its lights.
+    """
+
+    def is_part(signal: Signal) -> bool:
+        return any(key in lane_map.lanes for key in signal.lanes)
+
+    heads = [head for head in street.heads if is_part(head.signal)]
+    lane_map = replace(
+        lane_map,
+        signals=_timed(heads, line, front_m, cruise_mps),
+        give_way=tuple(signal for signal in street.give_way if is_part(signal)),
+    )
+    return lane_map, heads
+
+
 def _inside_bends(line: Path, front_m: float) -> Path:
     """Return the line of the rear axle, moved to the inside of bends by half of what the front of
     the car swings out there.
@@ -280,7 +325,7 @@ def _timed(
     return with_cycles(heads, begins_us)
 
 
-def _said(way: Way, goal_m: float, heads: Sequence[Head], vehicles: int) -> tuple[str, ...]:
+def _notes(way: Way, goal_m: float, heads: Sequence[Head], vehicles: int) -> tuple[str, ...]:
     """Return what was chosen."""
     notes = [
         f"route of {goal_m:.0f} m from lane {way.lane_ids[0]}, with {vehicles} vehicles; the map "

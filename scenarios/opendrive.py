@@ -10,7 +10,7 @@ Source: ASAM OpenDRIVE 1.4 to 1.8. `scenarios.usdz` reads the same roads by Alpa
 import contextlib
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -149,6 +149,7 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
 def _ahead(
     road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Turns
 ) -> list[str]:
+    """Return the keys of the lanes that follow a lane of the section ``index`` of a road."""
     along = driven_along(road, lane)
     linked = lane.successors if along else lane.predecessors
     next_section = index + (1 if along else -1)
@@ -160,25 +161,35 @@ def _ahead(
     if link.kind == "junction":
         connected = turns.get((link.target, road.road_id, lane.lane_id), [])
         return [
-            lane_key(roads[r], 0 if at_start else len(roads[r].sections) - 1, i)
-            for r, at_start, i in connected
+            lane_key(roads[target], _entered(roads[target], at_start), i)
+            for target, at_start, i in connected
         ]
     target = roads.get(link.target)
     if target is None or not target.sections:
         return []
-    entered = 0 if link.at_start else len(target.sections) - 1
-    if not linked:  # the link may stand in the other road alone
-        back = target.predecessor if link.at_start else target.successor
-        joins = back is not None and (back.kind, back.target) == ("road", road.road_id)
-        linked = tuple(
-            target_lane.lane_id
-            for target_lane in target.sections[entered].lanes
-            if lane.lane_id
-            in (target_lane.predecessors if link.at_start else target_lane.successors)
-            and driven_along(target, target_lane) == link.at_start
-            and joins
-        )
-    return [lane_key(target, entered, i) for i in linked]
+    linked = linked or _linked_back(road, lane, target, link.at_start)
+    return [lane_key(target, _entered(target, link.at_start), i) for i in linked]
+
+
+def _entered(road: Road, at_start: bool) -> int:
+    """Return the section through which a road is entered."""
+    return 0 if at_start else len(road.sections) - 1
+
+
+def _linked_back(road: Road, lane: OdrLane, target: Road, at_start: bool) -> tuple[int, ...]:
+    """Return the lanes of the next road ``target`` that name a lane as the one before them: a link
+    may stand in the other road alone.
+    """
+    back = target.predecessor if at_start else target.successor
+    if back is None or (back.kind, back.target) != ("road", road.road_id):
+        return ()
+    lanes = target.sections[_entered(target, at_start)].lanes
+    return tuple(
+        target_lane.lane_id
+        for target_lane in lanes
+        if driven_along(target, target_lane) == at_start
+        and lane.lane_id in (target_lane.predecessors if at_start else target_lane.successors)
+    )
 
 
 def T_local_map(geo_reference: str, T_earth_local: F64) -> F64:
@@ -278,8 +289,7 @@ def read_lanes(
             with parsing(f"{place}, section {index}", "repair its numbers"):
                 section_lanes = _section(road, index, section, T_local_map, left_out, changing)
             lanes.update({one.lane_id: one for one in section_lanes})
-        ends_m = (one.s_m + one.length_m for one in road.records)
-        missing = road.length_m - max(ends_m, default=road.length_m)
+        missing = road.length_m - _end_m(road)
         if missing > MAX_MISSING_M:
             raise InputError(
                 f"{place}: a reference line that ends {missing:g} m before the road of {road.length_m:g} m",
@@ -307,6 +317,11 @@ def read_lanes(
     if apart:
         notes.append(f"{len(apart)} reference lines whose records do not join: {some_of(apart)}")
     return linked, (*notes, *link_notes, *odr.notes)
+
+
+def _end_m(road: Road) -> float:
+    """Return where the last record of a road's reference line ends; without records its length."""
+    return max((record.s_m + record.length_m for record in road.records), default=road.length_m)
 
 
 def read_street(files: SourceFiles, path: Path) -> StreetMap:
@@ -380,58 +395,67 @@ def _section(
         and np.isfinite(np.tan(cubics_at(road.superelevation, s))).all()
     ):
         raise ValueError(OFF_THE_ROAD)
-    out = []
-    marks = {lane.lane_id: lane.mark for lane in section.lanes}
+    lanes = []
     for lane, inner_t, outer_t in lane_borders(road, section, s):
-        sign = 1 if lane.lane_id > 0 else -1
         if not np.abs(outer_t).max() <= MAX_OFFSET_M:
             raise ValueError(OFF_THE_ROAD)
-        kind = KINDS.get(lane.kind)
-        wide = float(np.abs(outer_t - inner_t).max()) >= MIN_WIDTH_M
-        if kind is None or not wide:
-            left_out[
-                lane.kind if kind is None else f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"
-            ] += 1
+        if lane.kind not in KINDS:
+            left_out[lane.kind] += 1
             continue
-        near, far = (road_points(road, line, s, t, T_local_map) for t in (inner_t, outer_t))
-        turn = 1 if driven_along(road, lane) else -1
-        side = section.side(sign)
-        k = side.index(lane)
-        inside = side[k - 1] if k > 0 else None
-        outside = side[k + 1] if k + 1 < len(side) else None
-        inner_mark = marks.get(inside.lane_id if inside is not None else 0)
-        beside_ids = [
-            lane_key(road, index, n.lane_id)
-            if n is not None and n.kind in KINDS and n.reversed == lane.reversed
-            else None
-            for n in (inside, outside)
-        ]
-        # Seen in driving direction the middle of the road is on the left, with left-hand
-        # traffic on the right.
-        order = -1 if road.left_hand != lane.reversed else 1
-        edges = (near, far)[::order]
-        mark_types = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
-        beside_ids = beside_ids[::order]
-        left, right = (edge[::turn] for edge in edges)
-        limits = limits_in(lane, road, section)
-        if len(set(limits)) > 1:
+        if float(np.abs(outer_t - inner_t).max()) < MIN_WIDTH_M:
+            left_out[f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"] += 1
+            continue
+        borders = [road_points(road, line, s, t, T_local_map) for t in (inner_t, outer_t)]
+        lanes.append(_lane(road, index, section, lane, borders))
+        if len(set(limits_in(lane, road, section))) > 1:
             changing.append(lane_key(road, index, lane.lane_id))
-        out.append(
-            Lane(
-                lane_key(road, index, lane.lane_id),
-                densify((left + right) / 2),
-                left,
-                right,
-                "bus" if lane.closed and kind == "vehicle" else kind,
-                left_neighbour=beside_ids[0],
-                right_neighbour=beside_ids[1],
-                left_mark_type=mark_types[0],
-                right_mark_type=mark_types[1],
-                is_intersection=road.junction != "-1",
-                speed_limit_mps=min((mps for mps in limits if mps is not None), default=None),
-            )
-        )
-    return out
+    return lanes
+
+
+def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequence[F64]) -> Lane:
+    """Return a lane in driving direction.
+
+    Args:
+        road: Its road.
+        index: Number of its section.
+        section: Its section.
+        lane: What the file says of it.
+        borders: Its inner and its outer edge ``(N, 3)``, metres, along the road.
+    """
+    side = section.side(1 if lane.lane_id > 0 else -1)
+    k = side.index(lane)
+    inside = side[k - 1] if k > 0 else None
+    outside = side[k + 1] if k + 1 < len(side) else None
+    marks = {other.lane_id: other.mark for other in section.lanes}
+    inner_mark = marks.get(inside.lane_id if inside is not None else 0)
+    beside_ids = [
+        lane_key(road, index, neighbour.lane_id)
+        if neighbour is not None and neighbour.kind in KINDS and neighbour.reversed == lane.reversed
+        else None
+        for neighbour in (inside, outside)
+    ]
+    # Seen in driving direction the middle of the road is on the left, with left-hand traffic on
+    # the right.
+    order = -1 if road.left_hand != lane.reversed else 1
+    left_mark_type, right_mark_type = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
+    left_id, right_id = beside_ids[::order]
+    turn = 1 if driven_along(road, lane) else -1
+    left, right = (edge[::turn] for edge in borders[::order])
+    limits = [mps for mps in limits_in(lane, road, section) if mps is not None]
+    kind = KINDS[lane.kind]
+    return Lane(
+        lane_key(road, index, lane.lane_id),
+        densify((left + right) / 2),
+        left,
+        right,
+        "bus" if lane.closed and kind == "vehicle" else kind,
+        left_neighbour=left_id,
+        right_neighbour=right_id,
+        left_mark_type=left_mark_type,
+        right_mark_type=right_mark_type,
+        is_intersection=road.junction != "-1",
+        speed_limit_mps=min(limits, default=None),
+    )
 
 
 def _stations(road: Road, section: Section) -> F64:

@@ -293,26 +293,43 @@ def parse_map(location: Path | str, root: Element) -> OdrMap:
             roads.append(_road(element, f"{location}, road {road_id}", originals, unused))
     with parsing(location, "correct the links of its junctions"):
         connections = tuple(
-            Connection(
-                junction.get("id", ""),
-                connection.get("incomingRoad", ""),
-                connection.get("connectingRoad", connection.get("linkedRoad", "")),
-                connection.get("contactPoint", "start") == "start",
-                tuple(
-                    (int(link.get("from", "")), int(link.get("to", "")))
-                    for link in connection.findall("laneLink")
-                ),
-                "linkedRoad" in connection.attrib,
-            )
+            _connection(junction, connection)
             for junction in root.findall("junction")
             for connection in junction.findall("connection")
         )
-    notes = [*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root)]
-    notes += [
+    controllers = {
+        control.get("signalId", ""): controller.get("id", "")
+        for controller in root.findall("controller")
+        for control in controller.findall("control")
+    }
+    geo_reference = (root.findtext(".//geoReference") or "").strip()
+    notes = (*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root), *_notes(root, unused))
+    return OdrMap(tuple(roads), connections, geo_reference, controllers, notes)
+
+
+def _connection(junction: Element, connection: Element) -> Connection:
+    return Connection(
+        junction.get("id", ""),
+        connection.get("incomingRoad", ""),
+        connection.get("connectingRoad", connection.get("linkedRoad", "")),
+        connection.get("contactPoint", "start") == "start",
+        tuple(
+            (int(link.get("from", "")), int(link.get("to", "")))
+            for link in connection.findall("laneLink")
+        ),
+        "linkedRoad" in connection.attrib,
+    )
+
+
+def _notes(root: Element, unused: Counter[str]) -> list[str]:
+    """Return notes on what a document holds and is not used; ``unused`` counts what the roads have
+    of it.
+    """
+    notes = [
         f"elements <{tag}> of the map are not read: {len(root.findall(tag))}"
         for tag in sorted({child.tag for child in root} - KNOWN)
     ]
-    notes += [f"{n} {what}" for what, n in sorted(unused.items())]
+    notes += [f"{n} {element}" for element, n in sorted(unused.items())]
     if root.find("header/offset") is not None:
         notes.append(
             "the offset in the map's header is not applied: its coordinates are as written"
@@ -338,13 +355,7 @@ def parse_map(location: Path | str, root: Element) -> OdrMap:
     shapes = len(root.findall(".//lateralProfile/shape"))
     if shapes:
         notes.append(f"{shapes} cross section shapes of the map are not used")
-    controllers = {
-        control.get("signalId", ""): controller.get("id", "")
-        for controller in root.findall("controller")
-        for control in controller.findall("control")
-    }
-    geo_reference = (root.findtext(".//geoReference") or "").strip()
-    return OdrMap(tuple(roads), connections, geo_reference, controllers, tuple(notes))
+    return notes
 
 
 def _odd_sides(elements: Mapping[str, Element]) -> list[str]:

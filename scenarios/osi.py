@@ -6,7 +6,7 @@ the first message that has any; a lane of the type intersection is an area, thro
 of lanes that it joins gets a lane.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,16 @@ from alpasim_plugin.core.geometry import (
     step_lengths,
     unit,
 )
-from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    F64,
+    Box,
+    HeightField,
+    Lane,
+    LaneMap,
+    LaneMarkType,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.world.ground import flat, height_at
 from scenarios.map_lines import bordered, corridor, ground_of, is_left_of, rails, same_way
 from scenarios.osi_messages import OSI, UNREAD, ground_truths, met_fields
@@ -102,44 +111,15 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     """
     file = Path(path)
     files = SourceFiles()
-    tracks: dict[int, _Track] = {}
-    count = 0
-    why = f"object {ego}"
-    roads: Any = None
-    notes: list[str] = []
-    for truth in ground_truths(files, file):
-        message = truth.message
-        if not count:
-            unread = {name: len(getattr(message, name)) for name in UNREAD}
-            notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
-            notes += OSI.notes(met_fields(message))
-        count += 1
-        if ego is None and truth.host is not None:
-            ego = str(truth.host)
-            why = "the host vehicle"
-        if roads is None and message.lane:
-            roads = message
-        t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
-        for moving_object in message.moving_object:
-            place = moving_object.base.position
-            turn = moving_object.base.orientation
-            row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
-            tracks.setdefault(moving_object.id.value, _Track(moving_object)).rows.append(row)
-    if ego is None:
-        ego = _usual_ego(file, tracks, count)
-        why = "the first vehicle that is always there"
-    chosen = next((key for key in tracks if str(key) == ego), None)
-    if chosen is None:
-        raise InputError(
-            f"{file}: no moving object {ego!r} for the ego",
-            f"choose it by ego among {', '.join(map(str, sorted(tracks))) or 'none'}",
-        )
+    trace = _read_trace(files, file)
+    chosen, why = _choose_ego(file, trace, ego)
+    tracks = trace.tracks
     origin = np.array([*np.round(tracks[chosen].rows[0][1:3]), 0.0])
-    lanes = {} if roads is None else _lanes(file, roads, origin)
-    on_lanes = any(lane.kind == "vehicle" for lane in lanes.values())
+    lanes = {} if trace.roads is None else _lanes(file, trace.roads, origin)
+    has_lanes = any(lane.kind == "vehicle" for lane in lanes.values())
     vehicle, axle_notes = _vehicle(tracks[chosen])
-    notes += axle_notes
-    if on_lanes:
+    notes = [f"ego is {why}: {chosen}", *trace.notes, *axle_notes]
+    if has_lanes:
         points = np.array(tracks[chosen].rows)[:, 1:4] - origin
         near(f"{file}, object {chosen}", points)
         lanes, on_ground, height_notes = _at_one_height(file, lanes, points, vehicle.box.height_m)
@@ -152,14 +132,12 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     }
     T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
     ego_log = offset_trajectory(centres[chosen], T_centre_rig)
-    if on_lanes:
+    if has_lanes:
         lane_map = bordered(lanes, LaneMap({}))
         ground = ground_of(lane_map, ego_log.xyz)
     else:
         notes.append("the trace holds no lanes: the driven path is one lane without lane markings")
-        ground = flat(float(np.median(ego_log.xyz[:, 2])))
-        lane_map = corridor(ego_log, ground)
-        lane_map = bordered(lane_map.lanes, lane_map)
+        lane_map, ground = _driven_lane(ego_log)
     actors = [
         actor
         for key, centre in centres.items()
@@ -177,8 +155,81 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         (),
         (float(origin[0]), float(origin[1]), 0.0),
         files.content_hash,
-        (f"ego is {why}: {chosen}", *notes),
+        tuple(notes),
     )
+
+
+def _driven_lane(ego_log: Trajectory) -> tuple[LaneMap, HeightField]:
+    """Return one lane along a drive on level ground."""
+    ground = flat(float(np.median(ego_log.xyz[:, 2])))
+    lane_map = corridor(ego_log, ground)
+    return bordered(lane_map.lanes, lane_map), ground
+
+
+@dataclass
+class _Trace:
+    """What the messages of a trace say.
+
+    Attributes:
+        tracks: Moving objects by id.
+        n_messages: How many messages there are.
+        host: Id of the host vehicle that the first message with one names.
+        roads: The first message with lanes.
+        notes: What was left out.
+    """
+
+    tracks: dict[int, _Track] = field(default_factory=dict)
+    n_messages: int = 0
+    host: str | None = None
+    roads: Any = None
+    notes: list[str] = field(default_factory=list)
+
+
+def _read_trace(files: SourceFiles, path: Path) -> _Trace:
+    """Collect the moving objects of all messages."""
+    trace = _Trace()
+    for truth in ground_truths(files, path):
+        message = truth.message
+        if not trace.n_messages:
+            unread = {name: len(getattr(message, name)) for name in UNREAD}
+            trace.notes += [f"{name} left out: {n}" for name, n in sorted(unread.items()) if n]
+            trace.notes += OSI.notes(met_fields(message))
+        trace.n_messages += 1
+        if trace.host is None and truth.host is not None:
+            trace.host = str(truth.host)
+        if trace.roads is None and message.lane:
+            trace.roads = message
+        t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
+        for moving_object in message.moving_object:
+            place = moving_object.base.position
+            turn = moving_object.base.orientation
+            row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
+            key = moving_object.id.value
+            trace.tracks.setdefault(key, _Track(moving_object)).rows.append(row)
+    return trace
+
+
+def _choose_ego(path: Path, trace: _Trace, ego: str | None) -> tuple[int, str]:
+    """Return the id of the moving object that becomes the ego, and why it does.
+
+    Raises:
+        InputError: There is no such object, or none can be chosen.
+    """
+    if ego is not None:
+        why = f"object {ego}"
+    elif trace.host is not None:
+        ego = trace.host
+        why = "the host vehicle"
+    else:
+        ego = _usual_ego(path, trace.tracks, trace.n_messages)
+        why = "the first vehicle that is always there"
+    chosen = next((key for key in trace.tracks if str(key) == ego), None)
+    if chosen is None:
+        raise InputError(
+            f"{path}: no moving object {ego!r} for the ego",
+            f"choose it by ego among {', '.join(map(str, sorted(trace.tracks))) or 'none'}",
+        )
+    return chosen, why
 
 
 def _usual_ego(path: Path, tracks: Mapping[int, _Track], n_messages: int) -> str:
@@ -334,30 +385,24 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
     sides = []
     for ids in (facts.left_lane_boundary_id, facts.right_lane_boundary_id):
         lane_borders = [borders[ref.value] for ref in ids if ref.value in borders]
-        points = [_points(p.position for p in border.boundary_line) for border in lane_borders]
-        border_points = np.concatenate([np.zeros((0, 3)), *points]) - origin
-        s_m = np.array([project(centre, point)[0] for point in border_points])
-        order = np.argsort(s_m, kind="stable")
-        line = border_points[order]
-        steps = step_lengths(line)
-        edge = line[np.concatenate([[True], steps > 1e-6])] if len(line) else line
-        if len(edge) < 2:
+        edge = _edge(lane_borders, centre, origin)
+        if edge is None:
             return None
         sides.append((near(location, edge), _mark_type(lane_borders[0])))
-    ahead = [str(pair.successor_lane_id.value) for pair in facts.lane_pairing]
-    behind = [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing]
+    pairing = facts.lane_pairing
+    ahead = [str(pair.successor_lane_id.value) for pair in pairing]
     beside = [
         str(ids[0].value) if ids else None
         for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
     ]
     if not facts.centerline_is_driving_direction:
         sides = [(edge[::-1], mark_type) for edge, mark_type in sides[::-1]]
-        ahead = behind
+        ahead = [str(pair.antecessor_lane_id.value) for pair in pairing]
         beside = beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):
         sides = sides[::-1]
     (left, left_mark_type), (right, right_mark_type) = sides
-    if min(float(arc_lengths(edge)[-1]) for edge in (left, right)) <= 0.0:
+    if arc_lengths(left)[-1] <= 0.0 or arc_lengths(right)[-1] <= 0.0:
         return None
     return Lane(
         str(road_lane.id.value),
@@ -371,6 +416,17 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         left_mark_type=left_mark_type,
         right_mark_type=right_mark_type,
     )
+
+
+def _edge(lane_borders: Sequence[Any], centre: F64, origin: F64) -> F64 | None:
+    """Join the boundaries of one side of a lane along its centre ``(N, 3)``; None for no line."""
+    points = [_points(p.position for p in border.boundary_line) for border in lane_borders]
+    border_points = np.concatenate([np.zeros((0, 3)), *points]) - origin
+    s_m = np.array([project(centre, point)[0] for point in border_points])
+    line = border_points[np.argsort(s_m, kind="stable")]
+    if len(line):
+        line = line[np.concatenate([[True], step_lengths(line) > 1e-6])]
+    return line if len(line) > 1 else None
 
 
 def _points(vectors: Any) -> F64:

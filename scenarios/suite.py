@@ -162,21 +162,10 @@ def expand(
 
 
 def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRef]:
+    """Return the scenarios that a name stands for; ``opened`` collects the suites on the way."""
     path = _locate(text, base)
     if os.path.isdir(path):
-        if source_of(path) is not None:
-            return [ScenarioRef(str(path))]
-        files = [
-            f
-            for f in sorted(path.iterdir())
-            if f.suffix in (".yaml", ".yml") and "scenarios" not in _head(f)
-        ]
-        if not files:
-            raise InputError(
-                f"{path}: a folder without scenario files",
-                import_advice(path) or "give a folder of scenario .yaml files, or a log folder",
-            )
-        return [ScenarioRef(str(f)) for f in files]
+        return _in_folder(path)
     if path.suffix not in (".yaml", ".yml") or "scenarios" not in _head(path):
         return [ScenarioRef(str(path))]
     opened.append(path)
@@ -202,6 +191,23 @@ def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRe
             for seed in (item.seeds or (r.seed,))
         ]
     return out
+
+
+def _in_folder(path: Path) -> list[ScenarioRef]:
+    """Return the recorded log that a folder is, or the scenario files that lie in it."""
+    if source_of(path) is not None:
+        return [ScenarioRef(str(path))]
+    files = [
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix in (".yaml", ".yml") and "scenarios" not in _head(file)
+    ]
+    if not files:
+        raise InputError(
+            f"{path}: a folder without scenario files",
+            import_advice(path) or "give a folder of scenario .yaml files, or a log folder",
+        )
+    return [ScenarioRef(str(file)) for file in files]
 
 
 def _locate(text: str, base: Path | None) -> Path:

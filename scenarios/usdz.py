@@ -114,28 +114,25 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
                 "use a scene with map tables or map.xodr: its road is what gets dressed",
             )
         actors = _actors(archive)
-        static = sum(actor.is_static for actor in actors)
         cameras, camera_notes = front_wide(archive)
-        inside = ", ".join(
-            f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive
-        )
         files.met += [
             part if "/" in part else field_name("archive", part) for part in archive.parts
         ]
+        model_note = _model_note(archive)
     surface = [*lane_edges(road.lane_map.lanes), *road.lane_map.road_edges, ego_log.xyz]
     ground = from_points(np.concatenate(surface), GROUND_CELL_M, ego_log.xyz)
-    model = f"{inside} is a checkpoint of a closed renderer and is not read"
     notes = [
-        f"{model if inside else 'no reconstruction in this scene'}; the map is dressed instead",
+        model_note,
         "tracks are replayed as stored, without AlpaSim's smoothing",
         *road.notes,
         *camera_notes,
         *vehicle_notes,
         *USDZ.notes(files.met),
     ]
-    if static:
+    n_static = sum(actor.is_static for actor in actors)
+    if n_static:
         notes.append(
-            f"{static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still"
+            f"{n_static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still"
         )
     return RecordedLog(
         scene_id=scene_id,
@@ -152,6 +149,17 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
         first_frame_us=first_frame_us,
         alpasim_map=road.alpasim,
     )
+
+
+def _model_note(archive: Archive) -> str:
+    """Say which reconstruction a scene holds; none of them is read."""
+    inside = ", ".join(
+        f"{name} ({archive.sizes[name]} bytes)" for name in RECONSTRUCTIONS if name in archive
+    )
+    model = "no reconstruction in this scene"
+    if inside:
+        model = f"{inside} is a checkpoint of a closed renderer and is not read"
+    return f"{model}; the map is dressed instead"
 
 
 def usdz_scene_id(path: str | Path) -> str:
@@ -309,7 +317,8 @@ def alpasim_map(odr: OdrMap, T_local_map: F64) -> LaneMap:
     )
 
 
-def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[str, F64]) -> None:
+def _reference_line(road: Road) -> F64:
+    """Return the points ``(N, 4)`` of a road's lines and arcs: x, y, heading, height."""
     rows = []
     passed_m = 0.0
     for record in road.records:
@@ -320,23 +329,22 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
         )
         rows.append(np.column_stack([record.at(s), cubics_at(road.elevation, passed_m + s)]))
         passed_m += record.length_m
-    line = np.concatenate(rows) if rows else np.zeros((0, 4))
+    return np.concatenate(rows) if rows else np.zeros((0, 4))
+
+
+def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[str, F64]) -> None:
+    """Add a road's lanes (centre, left and right edge) and its two road edges to those before."""
+    line = _reference_line(road)
     if not len(line) or not road.sections:
         return
     s = np.asarray(STEP_M * np.arange(len(line)), dtype=np.float64)
     line[:, :2] = beside(line[:, :3], cubics_at(road.lane_offset, s))
     z = line[:, 3]
-    by_id: dict[int, list[F64]] = {}
-    kinds: dict[int, str] = {}
-    for section in road.sections:
-        for lane in (*section.side(1), *section.side(-1)):
-            kinds.setdefault(lane.lane_id, lane.kind.lower())
-            if len(lane.widths):
-                by_id.setdefault(lane.lane_id, []).append(lane.widths)
+    widths_of, kinds = _lane_widths(road)
     for sign, name in ((1, "L"), (-1, "R")):
         inner = line[:, :2]
-        for lane_id in sorted((i for i in by_id if i * sign > 0), key=abs):
-            widths = np.concatenate(by_id[lane_id])
+        for lane_id in sorted((i for i in widths_of if i * sign > 0), key=abs):
+            widths = np.concatenate(widths_of[lane_id])
             width = cubics_at(widths[np.argsort(widths[:, 0], kind="stable")], s)
             inner_xyz = np.column_stack([inner, line[:, 2]])
             rows = [
@@ -352,12 +360,24 @@ def _add_road(road: Road, lanes: dict[str, tuple[F64, F64, F64]], edges: dict[st
                 lanes[f"{road.road_id}_{lane_id}"] = (centre, left, right)
             inner = rows[2][:, :2]
             edges[f"{road.road_id}_{name}"] = rows[2]
-    if by_id and road.junction == "-1":
+    if widths_of and road.junction == "-1":
         for sign, name in ((1, "L"), (-1, "R")):
             lone = np.column_stack(
                 [beside(line[:, :3], np.full(len(line), sign * LONE_EDGE_M)), np.zeros(len(line))]
             )
             edges.setdefault(f"{road.road_id}_{name}", lone)
+
+
+def _lane_widths(road: Road) -> tuple[dict[int, list[F64]], dict[int, str]]:
+    """Return the records of width of each lane over all sections, and its kind in the first."""
+    widths_of: dict[int, list[F64]] = {}
+    kinds: dict[int, str] = {}
+    for section in road.sections:
+        for lane in (*section.side(1), *section.side(-1)):
+            kinds.setdefault(lane.lane_id, lane.kind.lower())
+            if len(lane.widths):
+                widths_of.setdefault(lane.lane_id, []).append(lane.widths)
+    return widths_of, kinds
 
 
 def _without_crossing(

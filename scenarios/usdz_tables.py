@@ -13,6 +13,7 @@ a link of a lane to no sign, a sign without an id, a stop line marked implicit.
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,16 +94,7 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
     for key, row in _rows(archive, folder, "association"):
         objects = tuple(str(one) for one in row.get("objects") or ())
         links.setdefault((str(key.get("kind")), str(row.get("subjects"))), objects)
-    rails_of: dict[str, tuple[F64, F64]] = {}
-    for key, row in rows:
-        lane_id = str(key["map_id"])
-        do_this = "give every lane two rails with the same number of points, at least two"
-        with parsing(f"{archive.path}, {folder}, lane {lane_id}", do_this):
-            left = points(row["left_rail"])
-            right = points(row["right_rail"])
-            if len(left) != len(right) or len(left) < 2:
-                raise ValueError(f"rails of {len(left)} and {len(right)} points")
-        rails_of[lane_id] = left, right
+    rails_of = _rails(archive, folder, rows)
     lanes = {}
     for lane_id, (left, right) in rails_of.items():
         neighbours = {
@@ -118,6 +110,26 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
             left_neighbour=next(iter(neighbours["LEFT_LANE"]), None),
             right_neighbour=next(iter(neighbours["RIGHT_LANE"]), None),
         )
+    return replace(_beside_lanes(archive, folder), lanes=lanes)
+
+
+def _rails(archive: Archive, folder: str, rows: list[Row]) -> dict[str, tuple[F64, F64]]:
+    """Return the left and the right rail ``(N, 3)`` of each lane."""
+    rails_of: dict[str, tuple[F64, F64]] = {}
+    for key, row in rows:
+        lane_id = str(key["map_id"])
+        do_this = "give every lane two rails with the same number of points, at least two"
+        with parsing(f"{archive.path}, {folder}, lane {lane_id}", do_this):
+            left = points(row["left_rail"])
+            right = points(row["right_rail"])
+            if len(left) != len(right) or len(left) < 2:
+                raise ValueError(f"rails of {len(left)} and {len(right)} points")
+        rails_of[lane_id] = left, right
+    return rails_of
+
+
+def _beside_lanes(archive: Archive, folder: str) -> LaneMap:
+    """Return what a map has beside its lanes: road edges, stop lines and signs."""
     edges: dict[str, F64] = {}
     for key, row in _rows(archive, folder, "road_boundary"):
         edges.setdefault(str(key.get("map_id")), points(row.get("location") or []))
@@ -131,7 +143,7 @@ def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
         if key.get("map_id") is not None and row.get("center"):
             signs.append((shifted(*points([row["center"]])[0]), SIGN))
     return LaneMap(
-        lanes,
+        {},
         tuple(with_vertices(edge) for edge in edges.values() if len(edge) > 1),
         stop_lines=tuple(line for line in stop_lines if len(line) > 1),
         signs=tuple(signs),

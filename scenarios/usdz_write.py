@@ -59,38 +59,12 @@ def write_usdz(path: Path, scenario: Scenario) -> None:
             "export a scene with a map: AlpaSim routes and scores along lanes",
         )
     mesh = ground_mesh(scenario)
-    actors = [actor for actor in scenario.actors if len(actor.track)]
-    tracks = [_lasting(actor, scenario.ego_log) for actor in actors]
     members: dict[str, bytes] = {
         "metadata.yaml": yaml.safe_dump(
             _metadata(scenario, list(cameras)), sort_keys=False
         ).encode(),
         "rig_trajectories.json": json.dumps(_rig(scenario, cameras)).encode(),
-        "sequence_tracks.json": json.dumps(
-            {
-                clip: {
-                    "tracks_data": {
-                        "tracks_id": [actor.actor_id for actor in actors],
-                        "tracks_label_class": [
-                            _LABELS.get(actor.label, actor.label) for actor in actors
-                        ],
-                        "tracks_flags": [
-                            [] if actor.is_static else ["CONTROLLABLE"] for actor in actors
-                        ],
-                        "tracks_timestamps_us": [track.t_us.tolist() for track in tracks],
-                        "tracks_poses": [
-                            np.column_stack([track.xyz, track.quat[:, [1, 2, 3, 0]]]).tolist()
-                            for track in tracks
-                        ],
-                    },
-                    "cuboidtracks_data": {
-                        "cuboids_dims": [
-                            [a.box.length_m, a.box.width_m, a.box.height_m] for a in actors
-                        ]
-                    },
-                }
-            }
-        ).encode(),
+        "sequence_tracks.json": json.dumps({clip: _tracks(scenario)}).encode(),
         **map_tables(lane_map, clip),
         "clipgt/calibration_estimate.parquet": calibration_table(cameras, clip),
         "mesh.ply": mesh,
@@ -104,6 +78,28 @@ def write_usdz(path: Path, scenario: Scenario) -> None:
             archive.writestr(
                 zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data, zipfile.ZIP_DEFLATED
             )
+
+
+def _tracks(scenario: Scenario) -> JsonObject:
+    """Return the tracks of the road users as ``sequence_tracks.json`` holds them."""
+    actors = [actor for actor in scenario.actors if len(actor.track)]
+    tracks = [_lasting(actor, scenario.ego_log) for actor in actors]
+    sizes = [actor.box for actor in actors]
+    return {
+        "tracks_data": {
+            "tracks_id": [actor.actor_id for actor in actors],
+            "tracks_label_class": [_LABELS.get(actor.label, actor.label) for actor in actors],
+            "tracks_flags": [[] if actor.is_static else ["CONTROLLABLE"] for actor in actors],
+            "tracks_timestamps_us": [track.t_us.tolist() for track in tracks],
+            "tracks_poses": [
+                np.column_stack([track.xyz, track.quat[:, [1, 2, 3, 0]]]).tolist()
+                for track in tracks
+            ],
+        },
+        "cuboidtracks_data": {
+            "cuboids_dims": [[box.length_m, box.width_m, box.height_m] for box in sizes]
+        },
+    }
 
 
 def alpasim_cameras(cameras: tuple[CameraSpec, ...]) -> dict[str, CameraSpec]:

@@ -91,16 +91,9 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Scen
         for loc, value in located
         for below in _paths_below(value)
     )
-    chosen: JsonObject = {}
-    for key, rule in written.variations.items():
-        rng = stream(scene_id, written.seed, f"scenario/variation/{key}")
-        if isinstance(rule, RangeSpec):
-            chosen[key] = float(rng.uniform(rule.low, rule.high))
-        else:
-            chosen[key] = rule.choice[int(rng.integers(len(rule.choice)))]
     kept = [
         f"{key}={json.dumps(value)}"
-        for key, value in chosen.items()
+        for key, value in _drawn_values(written, scene_id).items()
         if fixed.isdisjoint(_and_above(_by_id(key, ids)))
     ]
     document = apply_overrides(document, kept, origin="variation")
@@ -108,6 +101,26 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Scen
     again = [f"{'.'.join(map(str, loc))}={json.dumps(value)}" for loc, value in located]
     document = apply_overrides(document, again)
     spec = validate(ScenarioSpec, document)
+    _check_actors(document, spec)
+    if spec.seed != AS_WRITTEN:
+        spec = _jitter(spec, scene_id, fixed)
+    return SceneDraft(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
+
+
+def _drawn_values(spec: ScenarioSpec, scene_id: str) -> JsonObject:
+    """Draw a value for each key that varies, each from a stream of its own."""
+    values: JsonObject = {}
+    for key, rule in spec.variations.items():
+        rng = stream(scene_id, spec.seed, f"scenario/variation/{key}")
+        if isinstance(rule, RangeSpec):
+            values[key] = float(rng.uniform(rule.low, rule.high))
+        else:
+            values[key] = rule.choice[int(rng.integers(len(rule.choice)))]
+    return values
+
+
+def _check_actors(document: Document, spec: ScenarioSpec) -> None:
+    """Refuse actors of one id, and actors where a log or a map brings the traffic."""
     index_by_id: dict[str, int] = {}
     for i, actor in enumerate(spec.actors):
         if actor.id in index_by_id:
@@ -124,9 +137,6 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Scen
             "actors beside a recorded log or a map",
             "remove actors; log.actors and map.vehicles choose the traffic",
         )
-    if spec.seed != AS_WRITTEN:
-        spec = _jitter(spec, scene_id, fixed)
-    return SceneDraft(document, spec, scene_id, spec.seed != own_seed, differences(written, spec))
 
 
 def _default_id(path: Path) -> str:
