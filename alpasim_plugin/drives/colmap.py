@@ -129,49 +129,25 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
         InputError: A file is missing, damaged or of a lens that OpenCV does not have; or there are
             no images.
     """
-    models = [(model, _records(model, "images", _image)) for model in models_in(folder)]
-    model, images = max(models, key=lambda model_images: len(model_images[1]))
-    notes = []
-    if len(models) > 1:
-        sizes = ", ".join(f"{path.relative_to(folder)}: {len(records)}" for path, records in models)
-        notes.append(
-            f"{len(models)} models, of which the one with most images is read: {model.relative_to(folder)} ({sizes} images)"
-        )
-    images.sort(key=lambda record: natural_order(record.name))
+    model, images, notes = _largest_model(folder)
     times_us, reference, rig_notes = _rig_times(model, images)
     if times_us:
         images = [record for record in images if record.number in times_us]
-    lenses = dict(_records(model, "cameras", _camera))
-    table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
     if not images:
         raise InputError(f"{model}: no image with a pose", DO_THIS)
     root = _images_root(folder, model, images[0].name, need_files)
-    folders = {_folder(record.name) for record in images}
-    shared = times_us and len(folders) < len({record.camera for record in images})
-    shots: dict[str, list[PosedPhotograph]] = {}
-    front = ""
-    for record in images:
-        if record.camera not in lenses:
-            raise InputError(f"{model}: images of camera {record.camera}, which it lacks", DO_THIS)
-        name = f"camera-{record.camera}" if shared else _folder(record.name)
-        location = f"{model}, image {record.name}"
-        time_us = times_us.get(record.number)
-        lens = lenses[record.camera]
-        shot = PosedPhotograph(
-            root / record.name, lens, record.T_world_camera, location, time_us, name, {}
-        )
-        shots.setdefault(name, []).append(shot)
-        if record.camera == reference:
-            front = front or name
+    shots = _shots(model, root, images, times_us)
+    names_of_reference = [
+        name
+        for record, name in zip(images, _camera_names(images, times_us), strict=True)
+        if record.camera == reference
+    ]
     names = sorted(shots)
-    front = next((name for name in names if "front" in name), front or names[0])
+    usual = [*names_of_reference, *names][0]
+    front = next((name for name in names if "front" in name), usual)
     cameras = [shots[name] for name in names]
     photographs = [shot for camera in cameras for shot in camera] if times_us else timed(cameras)
-    centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
-    sampled_centres = centres[:: max(1, len(centres) // 32)]
-    near = scipy.spatial.KDTree(sampled_centres).query(table[:, :3])[0]
-    spread = np.eye(3) * ((SPREAD * near) ** 2)[:, None, None]
-    points = Points(table[:, :3], table[:, 3:] / 255.0, spread)
+    points = _points(model, photographs)
     notes += rig_notes
     notes += COLMAP.notes(
         field_name("model", path.stem) for path in model.iterdir() if path.suffix == _ending(model)
@@ -182,6 +158,70 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
     return SourceDrive(
         "colmap", real(folder).name, tuple(photographs), front, points=points, notes=tuple(notes)
     )
+
+
+def _camera_names(images: Sequence[_Image], times_us: Mapping[int, int]) -> list[str]:
+    """Return the name of each image's camera: its folder, or its number where cameras of a rig share
+    a folder.
+    """
+    folders = {_folder(record.name) for record in images}
+    if times_us and len(folders) < len({record.camera for record in images}):
+        return [f"camera-{record.camera}" for record in images]
+    return [_folder(record.name) for record in images]
+
+
+def _shots(
+    model: Path, root: Path, images: Sequence[_Image], times_us: Mapping[int, int]
+) -> dict[str, list[PosedPhotograph]]:
+    """Return the photographs by the name of their camera.
+
+    Raises:
+        InputError: The model lacks the camera of an image.
+    """
+    lenses = dict(_records(model, "cameras", _camera))
+    shots: dict[str, list[PosedPhotograph]] = {}
+    for record, name in zip(images, _camera_names(images, times_us), strict=True):
+        if record.camera not in lenses:
+            raise InputError(f"{model}: images of camera {record.camera}, which it lacks", DO_THIS)
+        shot = PosedPhotograph(
+            root / record.name,
+            lenses[record.camera],
+            record.T_world_camera,
+            f"{model}, image {record.name}",
+            times_us.get(record.number),
+            name,
+            {},
+        )
+        shots.setdefault(name, []).append(shot)
+    return shots
+
+
+def _largest_model(folder: Path) -> tuple[Path, list[_Image], list[str]]:
+    """Return the model with most images, its images in the natural order of their names, and a note
+    where there are several models.
+    """
+    models = [(model, _records(model, "images", _image)) for model in models_in(folder)]
+    model, images = max(models, key=lambda model_images: len(model_images[1]))
+    notes = []
+    if len(models) > 1:
+        sizes = ", ".join(f"{path.relative_to(folder)}: {len(records)}" for path, records in models)
+        notes.append(
+            f"{len(models)} models, of which the one with most images is read: {model.relative_to(folder)} ({sizes} images)"
+        )
+    images.sort(key=lambda record: natural_order(record.name))
+    return model, images, notes
+
+
+def _points(model: Path, photographs: Sequence[PosedPhotograph]) -> Points:
+    """Return the points of a model; how far each may be off grows with its distance from the nearest
+    photograph.
+    """
+    table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
+    centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
+    sampled_centres = centres[:: max(1, len(centres) // 32)]
+    distance = scipy.spatial.KDTree(sampled_centres).query(table[:, :3])[0]
+    spread = np.eye(3) * ((SPREAD * distance) ** 2)[:, None, None]
+    return Points(table[:, :3], table[:, 3:] / 255.0, spread)
 
 
 def _rig_times(

@@ -77,13 +77,11 @@ def read_kitti(folder: Path) -> SourceDrive:
     left, right = next(pair for pair in PAIRS if os.path.isdir(folder / pair[0]))
     projections, notes = _projections(folder / CALIBRATION)
     poses = _poses(folder)
-    files = {}
-    for name in (left, right):
-        if os.path.isdir(folder / name):
-            images = [one for one in (folder / name).iterdir() if one.suffix.lower() in SUFFIXES]
-            files[name] = sorted(images, key=lambda path: natural_order(path.name))
-        else:
-            notes.append(f"no {right}: no second camera to measure the fit with")
+    files = {left: _images(folder / left)}
+    if os.path.isdir(folder / right):
+        files[right] = _images(folder / right)
+    else:
+        notes.append(f"no {right}: no second camera to measure the fit with")
     times = _times(folder / "times.txt", len(poses), notes)
     photographs = []
     for name, rows in _rows_of_poses(folder, files, len(poses)).items():
@@ -116,6 +114,12 @@ def read_kitti(folder: Path) -> SourceDrive:
         metric="the poses, metres",
         notes=tuple(notes),
     )
+
+
+def _images(folder: Path) -> list[Path]:
+    """Return the images of a camera in the natural order of their names."""
+    images = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    return sorted(images, key=lambda path: natural_order(path.name))
 
 
 def _rows_of_poses(folder: Path, files: dict[str, list[Path]], poses: int) -> dict[str, list[int]]:

@@ -30,7 +30,9 @@ from scenarios.recorded import SourceFiles
 
 CAMERA_HEIGHT_M = 1.5  # assumed where neither the files nor the user say it
 AHEAD_OF_AXLE_M = 1.6  # of the front camera, assumed: behind the windscreen of a car
-MOST_MPS, MOST_MPS2 = 100.0, 50.0  # speed and acceleration that no car has
+# Speed and acceleration that no car has.
+MOST_MPS = 100.0
+MOST_MPS2 = 50.0
 LEAST_MPS = 0.05  # the top speed of a drive whose times are in another unit
 MOST_STEP_MPS = 10.0  # a smaller change of speed may be an error of the poses
 OFF_THE_MAP_M = 5.0  # from the nearest lane, on the median

@@ -9,6 +9,7 @@ Source: the writers of py123d 0.7.0 (github.com/kesai-labs/py123d).
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -96,38 +97,17 @@ def read_py123d(folder: Path) -> SourceDrive:
     log, _ = _modality(folder, "sync", ())
     with parsing(folder / SYNC_FILE, DO_THIS):
         scene_id = str(log["log_name"])
-    body, (times, poses) = _modality(folder, EGO, ("timestamp_us", "imu_se3"))
-    location = folder / f"{EGO}.arrow"
-    with parsing(location, DO_THIS):
-        if times.null_count:
-            raise ValueError("a row without a time")
-        table = np.array(poses.to_pylist(), dtype=np.float64).reshape(-1, 7)
-        ego = checked_trajectory(location, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
-        for name in ("length", "width", "height", "wheel_base"):
-            BODY_M.check(body[name], f"{location}: {name}")
-        T_imu_axle = _T(body["rear_axle_to_imu_se3"])
-        T_imu_centre = _T(body["center_to_imu_se3"])
-        vehicle = Vehicle(
-            Box(body["length"], body["width"], body["height"]),
-            float(T_imu_centre[0, 3] - T_imu_axle[0, 3]),
-            body["wheel_base"],
-        )
+    ego, vehicle, T_imu_axle = _ego(folder)
     notes: list[str] = []
     keys = sorted(path.stem for path in folder.glob("*.arrow"))
-    cameras = {}
-    for key in (key for key in keys if key.startswith(CAMERA)):
-        photographs = _camera(folder, key, ego, notes)
-        if photographs:
-            cameras[key.removeprefix(CAMERA)] = photographs
-    if not cameras:
-        raise InputError(f"{folder}: no pinhole camera with images", DO_THIS)
+    cameras = _cameras(folder, keys, ego, notes)
     front = next((name for name in FRONT if name in cameras), min(cameras))
     last_us = int(cameras[front][: int(PHOTOGRAPHS.high)][-1].t_us or 0)
-    all_photographs = [one for photographs in cameras.values() for one in photographs]
-    chosen = tuple(one for one in all_photographs if int(one.t_us or 0) <= last_us)
-    if len(chosen) < len(all_photographs):
+    photographs = [shot for shots in cameras.values() for shot in shots]
+    chosen = tuple(shot for shot in photographs if int(shot.t_us or 0) <= last_us)
+    if len(chosen) < len(photographs):
         notes.append(
-            f"{len(all_photographs) - len(chosen)} photographs after the first of {front} left out"
+            f"{len(photographs) - len(chosen)} photographs after the first of {front} left out"
         )
     actors = _actors(folder, notes) if BOXES in keys else ()
     notes += PY123D.notes(_met(folder, keys))
@@ -146,6 +126,45 @@ def read_py123d(folder: Path) -> SourceDrive:
         vehicle=vehicle,
         front_xy_m=(ahead_m, left_m),
     )
+
+
+def _cameras(
+    folder: Path, keys: Sequence[str], ego: Trajectory, notes: list[str]
+) -> dict[str, list[PosedPhotograph]]:
+    """Return the photographs of the pinhole cameras among the files ``keys``, by name.
+
+    Raises:
+        InputError: There are none.
+    """
+    cameras = {}
+    for key in keys:
+        photographs = _camera(folder, key, ego, notes) if key.startswith(CAMERA) else []
+        if photographs:
+            cameras[key.removeprefix(CAMERA)] = photographs
+    if not cameras:
+        raise InputError(f"{folder}: no pinhole camera with images", DO_THIS)
+    return cameras
+
+
+def _ego(folder: Path) -> tuple[Trajectory, Vehicle, F64]:
+    """Return the poses of the ego's IMU, its body, and where its rear axle is, ``T_imu_axle``."""
+    body, (times, poses) = _modality(folder, EGO, ("timestamp_us", "imu_se3"))
+    location = folder / f"{EGO}.arrow"
+    with parsing(location, DO_THIS):
+        if times.null_count:
+            raise ValueError("a row without a time")
+        table = np.array(poses.to_pylist(), dtype=np.float64).reshape(-1, 7)
+        ego = checked_trajectory(location, times.to_numpy(), table[:, :3], table[:, 3:], least=2)
+        for name in ("length", "width", "height", "wheel_base"):
+            BODY_M.check(body[name], f"{location}: {name}")
+        T_imu_axle = _T(body["rear_axle_to_imu_se3"])
+        T_imu_centre = _T(body["center_to_imu_se3"])
+        vehicle = Vehicle(
+            Box(body["length"], body["width"], body["height"]),
+            float(T_imu_centre[0, 3] - T_imu_axle[0, 3]),
+            body["wheel_base"],
+        )
+    return ego, vehicle, T_imu_axle
 
 
 def _modality(
@@ -209,40 +228,63 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
         if facts["camera_model"] != "pinhole":
             notes.append(f"camera {name} left out: its lens is {facts['camera_model']}")
             return []
-        fx, fy, cx, cy, skew = facts["intrinsics"]
-        if skew:
-            raise ValueError(f"a lens with skew {skew:g}")
-        K = intrinsics(fx, fy, cx, cy) + FROM_CORNER
-        bends = None if facts["is_undistorted"] else facts["distortion"]
-        distortion = np.array(bends or [0.0] * 5)
-        lens = Lens(facts["width"], facts["height"], K, distortion).check(str(path), DO_THIS)
+        lens = _lens(facts, path)
         t_us = times.to_numpy()
         if not (np.diff(t_us) > 0).all():
             raise ValueError("times that do not increase")
         of_ego = interpolate(ego, t_us.clip(ego.t_us[0], ego.t_us[-1]))
         poses = of_ego @ _T(facts["camera_to_imu_se3"])
-        is_film = pa.types.is_integer(data.type)
-        film = _film(path.with_suffix(".mp4")) if is_film else []
-        if not is_film and not pa.types.is_string(data.type) and not pa.types.is_binary(data.type):
-            raise ValueError(f"images of the type {data.type}")
+        images = _images(path, data)
         photographs = []
-        for i, (value, pose) in enumerate(zip(data, stated.to_pylist(), strict=True)):
+        for i, (image, pose) in enumerate(zip(images, stated.to_pylist(), strict=True)):
             location = f"{path}, row {i}"
             T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), location)
-            file = path
-            encoded = None
-            if pa.types.is_string(data.type):
-                name_in_log = Path(value.as_py())
-                if name_in_log.is_absolute() or ".." in name_in_log.parts:
-                    raise ValueError(f"row {i}: the path {name_in_log} leads out of the log")
-                file = folder / name_in_log
-            else:
-                frame = _numbered(film, value.as_py(), "frame") if is_film else value.as_buffer()
-                encoded = memoryview(frame)
             photographs.append(
-                PosedPhotograph(file, lens, T, location, int(t_us[i]), name, {}, encoded)
+                PosedPhotograph(image.file, lens, T, location, int(t_us[i]), name, {}, image.data)
             )
     return photographs
+
+
+def _lens(facts: JsonObject, path: Path) -> Lens:
+    fx, fy, cx, cy, skew = facts["intrinsics"]
+    if skew:
+        raise ValueError(f"a lens with skew {skew:g}")
+    K = intrinsics(fx, fy, cx, cy) + FROM_CORNER
+    bends = None if facts["is_undistorted"] else facts["distortion"]
+    distortion = np.array(bends or [0.0] * 5)
+    return Lens(facts["width"], facts["height"], K, distortion).check(str(path), DO_THIS)
+
+
+@dataclass(frozen=True)
+class _StoredImage:
+    """Where an image is stored: in a file of its own, or as encoded bytes."""
+
+    file: Path
+    data: memoryview | None = None
+
+
+def _images(path: Path, column: pa.ChunkedArray) -> Iterator[_StoredImage]:
+    """Yield the images of a camera: paths in the log, frames of its film, or encoded bytes.
+
+    Raises:
+        ValueError: They are stored in another way, a path leads out of the log, or the film has no
+            such frame.
+    """
+    is_film = pa.types.is_integer(column.type)
+    is_path = pa.types.is_string(column.type)
+    if not is_film and not is_path and not pa.types.is_binary(column.type):
+        raise ValueError(f"images of the type {column.type}")
+    film = _film(path.with_suffix(".mp4")) if is_film else []
+    for i, value in enumerate(column):
+        if is_film:
+            yield _StoredImage(path, memoryview(_numbered(film, value.as_py(), "frame")))
+        elif is_path:
+            name_in_log = Path(value.as_py())
+            if name_in_log.is_absolute() or ".." in name_in_log.parts:
+                raise ValueError(f"row {i}: the path {name_in_log} leads out of the log")
+            yield _StoredImage(path.parent / name_in_log)
+        else:
+            yield _StoredImage(path, memoryview(value.as_buffer()))
 
 
 def _film(path: Path) -> list[bytes]:

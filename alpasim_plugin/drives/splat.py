@@ -79,29 +79,16 @@ def import_splat(
     with working_folder(out) as work:
         tell("reading the model", 0, 1)
         trained, key = read_inputs(file, poses)
-        drive = trained.drive
         cloud = trained.cloud
-        kept = trained.kept
         has_photographs = trained.has_photographs
         if os.path.exists(out):
             return finished(out, key)
-        size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"
-        quality = "no photographs: how well the model shows them is not measured"
-        if has_photographs:
-            quality = "what the model was trained with is not known: held-out photographs may have been among it"
-        notes = (
-            f"the model is {file.name}: {size}",
-            *kept.notes,
-            *trained.notes,
-            quality,
-            "the sky is black: a model of Gaussians has none",
-        )
         points = _surface(cloud)
         drive = replace(
-            drive,
+            trained.drive,
             scene_id=file.stem.split(".")[0],
             points=points,
-            notes=(*drive.notes, *notes),
+            notes=(*trained.drive.notes, *_notes(file, trained)),
         )
         placed = place(drive, points)
         _check_frame(file, placed)
@@ -139,6 +126,22 @@ class TrainedModel:
     kept: CleanReport
     notes: tuple[str, ...]
     has_photographs: bool
+
+
+def _notes(file: Path, trained: TrainedModel) -> tuple[str, ...]:
+    """Return what a reader must know of a model and of how well it is measured."""
+    kept = trained.kept
+    size = str(kept) if kept.n_kept < kept.n_input else f"{kept.n_kept} Gaussians"
+    quality = "no photographs: how well the model shows them is not measured"
+    if trained.has_photographs:
+        quality = "what the model was trained with is not known: held-out photographs may have been among it"
+    return (
+        f"the model is {file.name}: {size}",
+        *kept.notes,
+        *trained.notes,
+        quality,
+        "the sky is black: a model of Gaussians has none",
+    )
 
 
 def read_inputs(file: Path, poses: Path) -> tuple[TrainedModel, str]:
