@@ -80,24 +80,10 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
     """Say what is wrong with what a renderer returned for a request; empty if nothing."""
     if not isinstance(frame, Frame):
         return f"render returned {type(frame).__name__}, not a Frame"
-    wanted = (request.camera.height, request.camera.width, 3)
-    shape: Any
-    dtype: Any
-    if frame.pending:
-        shape = (*frame.size, 3)
-        dtype = np.dtype(np.uint8)
-    else:
-        shape = getattr(frame.rgb, "shape", None)
-        dtype = getattr(frame.rgb, "dtype", None)
-    if shape != wanted or dtype != np.uint8:
-        guess = ""
-        if shape == (3, *wanted[:2]):
-            guess = "; the channels come last"
-        elif shape == wanted:
-            guess = "; multiply 0..1 by 255"
-        return (
-            f"rgb is {dtype or type(frame.rgb).__name__} {shape or ''}, not uint8 {wanted}{guess}"
-        )
+    size = request.camera.height, request.camera.width
+    problem = _rgb_problem(frame, (*size, 3))
+    if problem:
+        return problem
     if (frame.t_us, frame.camera) != (request.t_us, request.camera.name):
         return f"the frame is stamped {frame.camera!r} at {frame.t_us} us"
     for label, high in (("alpha", ALPHA), ("depth", DEPTH_M)):
@@ -106,13 +92,31 @@ def _frame_problem(frame: Any, request: RenderRequest) -> str:
             continue
         shape = getattr(plane, "shape", None)
         dtype = getattr(plane, "dtype", None)
-        if shape != wanted[:2] or np.dtype(dtype).kind != "f":
-            return (
-                f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {wanted[:2]}"
-            )
+        if shape != size or np.dtype(dtype).kind != "f":
+            return f"{label} is {dtype or type(plane).__name__} {shape or ''}, not float {size}"
         if not (plane.min() >= -ROUNDING and plane.max() <= high + ROUNDING):
             return f"{label} is not finite, or not between 0 and {high:g}"
     return ""
+
+
+def _rgb_problem(frame: Frame, due: tuple[int, int, int]) -> str:
+    """Say why a frame's image is not uint8 of the shape ``due``; empty if it is."""
+    shape: Any
+    dtype: Any
+    if frame.pending:
+        shape = (*frame.size, 3)
+        dtype = np.dtype(np.uint8)
+    else:
+        shape = getattr(frame.rgb, "shape", None)
+        dtype = getattr(frame.rgb, "dtype", None)
+    if shape == due and dtype == np.uint8:
+        return ""
+    guess = ""
+    if shape == (3, *due[:2]):
+        guess = "; the channels come last"
+    elif shape == due:
+        guess = "; multiply 0..1 by 255"
+    return f"rgb is {dtype or type(frame.rgb).__name__} {shape or ''}, not uint8 {due}{guess}"
 
 
 def checked_sensors(policy: Policy) -> Sequence[SensorSpec]:

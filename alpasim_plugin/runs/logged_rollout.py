@@ -100,12 +100,12 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
     plan = make_plan([ref], [row.renderer], [row.policy], [row.seed], rollout_options)
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row.scene)
-    if loaded is None or cell.rollout_key != manifest["rollout_key"]:
-        difference = (
-            f"scenario {ref.path} now has the scene id {cell.scene!r}"
-            if loaded is None
-            else "content key differs"
-        )
+    difference = ""
+    if cell.rollout_key != manifest["rollout_key"]:
+        difference = "content key differs"
+    if loaded is None:
+        difference = f"scenario {ref.path} now has the scene id {cell.scene!r}"
+    if loaded is None or difference:
         raise InputError(
             f"{name}: {difference}: the scenario, a part or the version has changed since the log was written",
             "Run the rollout again.",

@@ -211,13 +211,7 @@ def make_plan(
                 make_controller(controller.name, scenario.vehicle)  # refuses friction
             parts = _part_digests(renderer, policy, controller)
             parts[f"source of {scenario.scene_id}"] = sources[scenario.source_part]
-            made_of = parts | {
-                SIMRUN: loop,
-                f"scene {scenario.scene_id}": scenario.content_hash,
-                "seed": str(seed),
-                "--images": options.images,
-                "--device": options.device,
-            }
+            made_of = parts | {SIMRUN: loop} | _facts_of(scenario, seed, options)
             rollout_key = digest(made_of)
             cells.append(
                 Cell(
@@ -237,6 +231,16 @@ def make_plan(
                 )
             )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def _facts_of(scenario: Scenario, seed: int, options: RunOptions) -> dict[str, str | None]:
+    """Return what determines a log beside the parts and the program."""
+    return {
+        f"scene {scenario.scene_id}": scenario.content_hash,
+        "seed": str(seed),
+        "--images": options.images,
+        "--device": options.device,
+    }
 
 
 def _check_names(names_by_kind: Mapping[str, Sequence[object]]) -> None:

@@ -110,12 +110,12 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
             f"{cell.name}: {'; '.join(notes) or 'no rollout'}",
             "Export a run whose rollouts have finished, with their logs.",
         )
-    content = run.scene_data(cell.scene)
-    if content is None:
+    scene_data = run.scene_data(cell.scene)
+    if scene_data is None:
         notes.append("the run has no map of the scene")
     else:
         first_us = min(int(log.ego.t_us[0]) for log in recorded)
-        items.insert(0, _map_item(content, recorded[0].ego_log.xyz, first_us))
+        items.insert(0, _map_item(scene_data, recorded[0].ego_log.xyz, first_us))
     facts = _facts(run, cell) | {"recording": cell.name, "notes": "\n".join(notes)}
     counts = _write(path, items, facts)
     return {

@@ -25,7 +25,7 @@ from alpasim_plugin.core.files import natural_order, real
 from alpasim_plugin.core.files.atomic import atomic_folder, write_bytes
 from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.interfaces import Fixer
-from alpasim_plugin.core.types import U8, Frame
+from alpasim_plugin.core.types import F32, U8, Frame
 from alpasim_plugin.fixers.refine import ChangeLimit, StreamStats, refine_frames
 from alpasim_plugin.log.video import UNSPECIFIED, TimedFrame, VideoFormat, VideoReader, VideoWriter
 
@@ -412,16 +412,24 @@ def _joined(
         timing.append(timed)
         alpha = None
         if "opacity" in frames_by_role:
-            image = frames_by_role["opacity"].image
-            sample = image[::8, ::8].astype(np.int16)
-            if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
-                raise InputError(
-                    f"{readers['opacity'].path}: frame {index} of the opacity is coloured",
-                    "give the accumulated opacity as a grey video, white where the input is reliable",
-                )
-            alpha = image[..., 1].astype(np.float32) / np.float32(255)
+            alpha = _alpha(frames_by_role["opacity"].image, index, readers["opacity"].path)
         sdmap = frames_by_role["sdmap"].image if "sdmap" in frames_by_role else None
         yield Frame(round(times[0] * 1_000_000), CAMERA, timed.image, alpha), sdmap
+
+
+def _alpha(image: U8, index: int, path: Path) -> F32:
+    """Return the opacity ``(H, W)`` in [0, 1] of a grey image.
+
+    Raises:
+        InputError: The image is coloured.
+    """
+    sample = image[::8, ::8].astype(np.int16)
+    if int((sample.max(axis=2) - sample.min(axis=2)).max()) > GREY_LEVELS:
+        raise InputError(
+            f"{path}: frame {index} of the opacity is coloured",
+            "give the accumulated opacity as a grey video, white where the input is reliable",
+        )
+    return image[..., 1].astype(np.float32) / np.float32(255)
 
 
 def _lengths_differ(role: str, path: Path, counts: str) -> InputError:

@@ -2,7 +2,7 @@
 
 import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -55,18 +55,23 @@ def store_same_poses(
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
         failed_us = int((first_failure(manifest) or {})["t_us"])
-        images_by_renderer: dict[str, list[tuple[int, str]]] = {}
-        for spec in plan.renderers:
-            if spec.name != cell.renderer.name:
-                users = [part for part in (spec.base, spec.fixer) if part and part.is_users]
-                work = partial(_images, plan, cell, log=log, failed_us=failed_us, threads=threads)
-                images_by_renderer[spec.name] = []
-                with suppress(SimrunError):  # its own rollouts show the error
-                    images_by_renderer[spec.name] = apart(
-                        work, spec, spec.name if users else "", threads
-                    )
+        work = partial(_images, plan, cell, log=log, failed_us=failed_us, threads=threads)
+        others = [spec for spec in plan.renderers if spec.name != cell.renderer.name]
+        images_by_renderer = {spec.name: _images_apart(work, spec, threads) for spec in others}
         images = {name: images for name, images in images_by_renderer.items() if images}
         write_json(path, {"key": key, "images": images})
+
+
+def _images_apart(
+    work: Callable[[RendererSpec], list[tuple[int, str]]], spec: RendererSpec, threads: int
+) -> list[tuple[int, str]]:
+    """Return the images of a renderer, a user's in a process of its own; none where it fails: its
+    own rollouts show the error.
+    """
+    is_users = any(part is not None and part.is_users for part in (spec.base, spec.fixer))
+    with suppress(SimrunError):
+        return apart(work, spec, spec.name if is_users else "", threads)
+    return []
 
 
 def images_key(

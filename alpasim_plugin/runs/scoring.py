@@ -69,13 +69,11 @@ def tabulate(
     chosen = find_preset(preset)
     contacts = contact_events(rollout, chosen) if chosen.contact == "between_steps" else ()
     # Reports draw the distance from the recorded path also of runs whose preset does not score it.
-    lateral_series = (
-        []
-        if any(metric_series.name == "lateral_bias_m" for metric_series in series)
-        else [lateral_bias(rollout)]
-    )
+    tabled = [*series]
+    if not any(metric_series.name == "lateral_bias_m" for metric_series in series):
+        tabled.append(lateral_bias(rollout))
     rows = []
-    for metric_series in (*series, *lateral_series):
+    for metric_series in tabled:
         reason = metric_series.reason
         for t_us, value, valid in zip(
             metric_series.t_us.tolist(),
@@ -85,19 +83,7 @@ def tabulate(
         ):
             row = _row(t_us, metric_series.name, None if np.isnan(value) else value)
             rows.append(row | {"valid": valid, "reason": "" if valid else reason})
-    # Rows of the ego's state, for plots and stratified results.
-    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    state: Mapping[str, F64] = {
-        "ego_x_m": rig.xyz[:, 0],
-        "ego_y_m": rig.xyz[:, 1],
-        "ego_yaw_rad": yaw_from_quat(rig.quat),
-        "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
-    }
-    rows += [
-        _row(t, name, float(v))
-        for name, values in state.items()
-        for t, v in zip(rig.t_us.tolist(), values, strict=True)
-    ]
+    rows += _ego_rows(rollout)
     for facts in frames:
         opacity = facts["opacity_mean"]
         rows.append(_row(facts["t_us"], "opacity_mean", opacity, "the renderer gives no opacity"))
@@ -109,6 +95,22 @@ def tabulate(
         "contacts": [contact.as_dict() for contact in contacts],
         "censored": reduction.ledger.as_dict(),
     }
+
+
+def _ego_rows(rollout: RolloutLog) -> list[JsonObject]:
+    """Return rows of the ego's state, for plots and stratified results."""
+    rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    state: Mapping[str, F64] = {
+        "ego_x_m": rig.xyz[:, 0],
+        "ego_y_m": rig.xyz[:, 1],
+        "ego_yaw_rad": yaw_from_quat(rig.quat),
+        "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
+    }
+    return [
+        _row(t, name, float(v))
+        for name, values in state.items()
+        for t, v in zip(rig.t_us.tolist(), values, strict=True)
+    ]
 
 
 def _row(t_us: int | None, metric: str, value: Any, why_missing: str = "") -> JsonObject:
