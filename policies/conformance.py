@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -345,54 +345,91 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None) -> Repo
 
 
 def _checked(policy: Policy, scenario: Scenario) -> Report:
+    """Return what a policy does in the situations, one after the other."""
     rig = {camera.name: camera for camera in scenario.cameras}
-    fault = sensors_problem(policy.sensors)
-    if not fault:
-        used = sorted({sensor.camera for sensor in policy.sensors})
-        unknown = [name for name in used if name not in rig]
-        if unknown:
-            fault = f"the policy asks for cameras {unknown}; the scenario has {sorted(rig)}"
+    fault = sensors_problem(policy.sensors) or _camera_fault(policy, rig)
     if fault:
         return Report((Check("sensors", False, fault),))
+    used = sorted({sensor.camera for sensor in policy.sensors})
     cameras = {name: rig[name] for name in used}
-    checks = [Check("sensors", True, f"asks for {used or 'no camera'}")]
     replays = getattr(policy, "controller", "") == "perfect"
     situations = [STRAIGHT, OLD_FRAME]
     if not replays:
         situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK, *(IMAGES if cameras else ())]
-    plans: dict[str, list[Plan]] = {}
     durations_ms: list[float] = []
-    for situation in situations:
-        driven = _drive(policy, situation, cameras, durations_ms)
-        if not isinstance(driven, str):
-            plans[situation.name] = driven
-            plan_check = _plan_fault(situation, driven)
-        elif situation in IMAGES:  # a policy may need the route
-            continue
-        else:
-            plan_check = Check("plans", False, f"in the situation {situation.name!r} {driven}")
-        if plan_check is not None and plan_check.name not in {check.name for check in checks}:
-            checks.append(plan_check)
+    plans, plan_checks = _plans_in(situations, policy, cameras, durations_ms)
+    checks = [Check("sensors", True, f"asks for {used or 'no camera'}"), *plan_checks]
     notes: tuple[Check, ...] = ()
     if all(check.ok for check in checks):
-        straight = plans["straight"]
-        checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
-        fine = "plans lead on along the road, in the rig frame"
-        checks.append(_check("direction", direction_fault(straight), fine))
-        checks += _memory_checks(policy, cameras, straight, OLD_FRAME if replays else SLOW_LEFT)
-        if not replays and all(check.ok for check in checks):
-            checks.append(_check("side", side_fault(plans), "no road leads to its wrong side"))
-        slow = [] if replays else _drive(policy, SLOW_LEFT, cameras, [])
-        if slow and not isinstance(slow, str):
-            fault = speed_fault(straight[0], slow[0])
-            checks.append(_check("speed", fault, "plans begin with a speed that a car can have"))
-            notes = tuple(remarks(plans))
+        driving_checks, notes = _driving_checks(policy, cameras, plans, replays)
+        checks += driving_checks
     latency_ms = (0.0, 0.0)
     if durations_ms:
         latency_ms = (float(np.median(durations_ms)), max(durations_ms))
         sentence = f"plans in {latency_ms[0]:.1f} ms, the limit is {LATENCY_MS:.0f} ms"
         checks.append(Check("latency", latency_ms[0] <= LATENCY_MS, sentence))
     return Report(tuple(checks), notes, latency_ms)
+
+
+def _camera_fault(policy: Policy, names: Collection[str]) -> str:
+    """Say which cameras a policy asks for that the scenario lacks; empty if none."""
+    unknown = sorted({sensor.camera for sensor in policy.sensors} - {*names})
+    if not unknown:
+        return ""
+    return f"the policy asks for cameras {unknown}; the scenario has {sorted(names)}"
+
+
+def _plans_in(
+    situations: Sequence[Situation],
+    policy: Policy,
+    cameras: dict[str, CameraSpec],
+    durations_ms: list[float],
+) -> tuple[dict[str, list[Plan]], list[Check]]:
+    """Return the plans of a policy by situation, and the first fault of each kind in them."""
+    plans: dict[str, list[Plan]] = {}
+    faults: dict[str, Check] = {}
+    for situation in situations:
+        driven = _drive(policy, situation, cameras, durations_ms)
+        if not isinstance(driven, str):
+            plans[situation.name] = driven
+            fault = _plan_fault(situation, driven)
+            if fault is not None:
+                faults.setdefault(fault.name, fault)
+        elif situation not in IMAGES:  # a policy may need the route
+            text = f"in the situation {situation.name!r} {driven}"
+            faults.setdefault("plans", Check("plans", False, text))
+    return plans, [*faults.values()]
+
+
+def _driving_checks(
+    policy: Policy, cameras: dict[str, CameraSpec], plans: dict[str, list[Plan]], replays: bool
+) -> tuple[list[Check], tuple[Check, ...]]:
+    """Check where the plans of a policy lead, whose form has no fault, and what it remembers.
+
+    Args:
+        policy: The policy.
+        cameras: Those that it uses.
+        plans: By situation.
+        replays: It drives a recorded way, whatever it sees.
+
+    Returns:
+        The checks, and remarks that are no faults.
+    """
+    straight = plans["straight"]
+    checks = [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
+    fine = "plans lead on along the road, in the rig frame"
+    checks.append(_check("direction", direction_fault(straight), fine))
+    checks += _memory_checks(policy, cameras, straight, OLD_FRAME if replays else SLOW_LEFT)
+    if replays:
+        return checks, ()
+    if all(check.ok for check in checks):
+        checks.append(_check("side", side_fault(plans), "no road leads to its wrong side"))
+    slow = _drive(policy, SLOW_LEFT, cameras, [])
+    if not slow or isinstance(slow, str):
+        return checks, ()
+    fault = speed_fault(straight[0], slow[0])
+    checks.append(_check("speed", fault, "plans begin with a speed that a car can have"))
+    return checks, tuple(remarks(plans))
 
 
 def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterator[Observation]:

@@ -10,12 +10,17 @@ corrects them, and a frame with many points therefore counts for more than a fra
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from alpasim_plugin.core.types import F64, Bool
 from policies.road_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)
 MEAN_WIDTH_M = 3.5
+# Of the histograms of paint over the lateral position.
+HALF_M = 7.0
+CELL_M = 0.1
+CELLS = round(2 * HALF_M / CELL_M)
 WIDTH_MEMORY_M = (
     40.0  # a border that is not seen is assumed at the mean width again after some such lengths
 )
@@ -160,6 +165,28 @@ def shift(lane: LaneState, lanes_left: int) -> LaneState:
     return replace(lane, mean=mean, cov=cov)
 
 
+def _cells(lateral_m: F64) -> npt.NDArray[np.intp]:
+    """Return the numbers of histogram cells at lateral positions; those outside have none of it."""
+    return np.floor((lateral_m + HALF_M) / CELL_M).astype(np.intp)
+
+
+def _paint_histograms(lateral_m: F64, paint: F64) -> F64:
+    """Return how much paint ``(S, CELLS)`` lies at each lateral position under each shape of the
+    lane, smoothed over neighbouring cells.
+
+    Args:
+        lateral_m: ``(S, N)`` of points under each shape.
+        paint: ``(N,)`` weight of the points.
+    """
+    bins = _cells(lateral_m)
+    valid = (bins >= 0) & (bins < CELLS)
+    flat = (np.arange(len(bins))[:, None] * CELLS + bins)[valid]
+    weights = np.broadcast_to(paint, bins.shape)[valid]
+    histogram = np.bincount(flat, weights, len(bins) * CELLS).reshape(len(bins), CELLS)
+    padded = np.pad(histogram, ((0, 0), (1, 1)))
+    return histogram + 0.5 * (padded[:, :-2] + padded[:, 2:])
+
+
 def search(
     points: PaintPoints, row_m: F64, offset_m: float, heading_rad: float, curvature_1pm: float
 ) -> LaneState | None:
@@ -179,17 +206,7 @@ def search(
     curvatures = curvature_1pm + np.array([-0.03, -0.015, -0.006, 0.0, 0.006, 0.015, 0.03])
     shapes = np.array([(h, c) for h in headings for c in curvatures])
     lateral = y[None, :] - shapes[:, :1] * x - shapes[:, 1:] * x**2 / 2
-    cell = 0.1
-    half = 7.0
-    n = round(2 * half / cell)
-    bins = np.floor((lateral + half) / cell).astype(np.intp)
-    valid = (bins >= 0) & (bins < n)
-    flat = (np.arange(len(shapes))[:, None] * n + bins)[valid]
-    histogram = np.bincount(
-        flat, np.broadcast_to(paint, bins.shape)[valid], len(shapes) * n
-    ).reshape(len(shapes), n)
-    padded = np.pad(histogram, ((0, 0), (1, 1)))
-    histogram = histogram + 0.5 * (padded[:, :-2] + padded[:, 2:])
+    histogram = _paint_histograms(lateral, paint)
     # Prefer the guess where lane markings are ambiguous.
     doubt = ((shapes[:, 0] - heading_rad) / 0.15) ** 2 + (
         (shapes[:, 1] - curvature_1pm) / 0.03
@@ -197,17 +214,9 @@ def search(
     best = int(np.argmax(np.sum(histogram**2, axis=1) / (1.0 + 0.1 * doubt)))
     pile = histogram[best]
     widths = np.arange(2.6, 4.7, 0.1)
-    centres = np.arange(-4.0, 4.0 + 1e-9, cell)
-    left, right = (
-        pile[
-            np.clip(
-                np.floor((centres[:, None] + side * widths / 2 + half) / cell).astype(np.intp),
-                0,
-                n - 1,
-            )
-        ]
-        for side in (1, -1)
-    )
+    centres = np.arange(-4.0, 4.0 + 1e-9, CELL_M)
+    left = pile[_cells(centres[:, None] + widths / 2).clip(0, CELLS - 1)]
+    right = pile[_cells(centres[:, None] - widths / 2).clip(0, CELLS - 1)]
     score = (
         np.minimum(left, 6.0) + np.minimum(right, 6.0) + np.minimum(np.minimum(left, right), 3.0)
     )

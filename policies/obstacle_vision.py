@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.core.types import F64, I64, U8
 from policies.road_vision import CELL_M, GroundGrid
 
 STRIPS = 4
@@ -121,16 +121,7 @@ def find_foot(
     rows = np.arange(len(distance))
     full = np.searchsorted(distance, distance / (1 - TALL))
     least = np.searchsorted(distance, distance / (1 - LOW))
-    # Where the line of sight through each strip at row i leaves the lane, at a later row k: in a
-    # curve, and to the sides.
-    middle = centre_y[:, None] + 0.5 * (EDGES_M[1:] + EDGES_M[:-1]) - grid.camera_y
-    # (R, STRIPS, R); in place from here on, as it is large
-    sight = middle[:, :, None] * (distance / distance[:, None, None])
-    sight += grid.camera_y
-    sight -= centre_y
-    has_left = np.abs(sight, out=sight) > LEAVE_LANE_M
-    has_left &= rows > rows[:, None, None]
-    left_at = np.argmax(has_left, axis=2)  # 0: nowhere, as no row is later than itself
+    left_at = _lane_left_at(distance, centre_y, grid)
     last = np.minimum(full[:, None], np.where(left_at > 0, left_at, len(rows)))
     candidate = ((grid.x_m >= min_x_m) & (grid.x_m <= max_x_m))[:, None]
     usable = (
@@ -163,6 +154,21 @@ def find_foot(
     level = _box_mean(narrow, behind, behind + 1, u[first : first + 1])[:, strips].mean(axis=1)
     i = first + int(np.argmax(level > 0.5))
     return float(grid.x_m[i]), float(np.hypot(0.3, 0.6 * grid.row_m[i]))
+
+
+def _lane_left_at(distance: F64, centre_y: F64, grid: GroundGrid) -> I64:
+    """Return the row ``(R, STRIPS)`` at which the line of sight through each strip of a row leaves
+    the lane, in a curve and to the sides; 0 where it does not.
+    """
+    rows = np.arange(len(distance))
+    middle = centre_y[:, None] + 0.5 * (EDGES_M[1:] + EDGES_M[:-1]) - grid.camera_y
+    # (R, STRIPS, R); in place from here on, as it is large
+    sight = middle[:, :, None] * (distance / distance[:, None, None])
+    sight += grid.camera_y
+    sight -= centre_y
+    has_left = np.abs(sight, out=sight) > LEAVE_LANE_M
+    has_left &= rows > rows[:, None, None]
+    return np.argmax(has_left, axis=2)  # no row is later than itself, so 0 stands for none
 
 
 def _sums_along_sight(value: U8, width_m: float, grid: GroundGrid) -> F64:

@@ -79,12 +79,7 @@ def rasterize_prepared(
     poses = node_poses([T for _, T in nodes], camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
     if camera.rolling is not None:
-        still = camera.motion(_IDENTITY, _IDENTITY)
-        for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
-            moves = (
-                None if T is None or T_start is None else (np.asarray(T, dtype=np.float64), T_start)
-            )
-            pose[POSE_TURN:] = still if moves is None else camera.motion(*moves)
+        _write_motion(poses, nodes, starts, camera)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = [
         (*prepared.arrays(), end - prepared.n_input, pose)
@@ -109,6 +104,20 @@ def rasterize_prepared(
     rgb = np.clip(colour + (1 - alpha[..., None]) * behind, 0, 1)
     depth = np.divide(depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 0)
     return RasterOutput(rgb, alpha, depth)
+
+
+def _write_motion(
+    poses: F64, nodes: Sequence[Node], starts: Sequence[F64 | None], camera: PinholeCamera
+) -> None:
+    """Write into the numbers of the nodes' poses how each moves while the shutter rolls; a node
+    without both poses stands.
+    """
+    still = camera.motion(_IDENTITY, _IDENTITY)
+    for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
+        if T is None or T_start is None:
+            pose[POSE_TURN:] = still
+        else:
+            pose[POSE_TURN:] = camera.motion(np.asarray(T, dtype=np.float64), T_start)
 
 
 def depth_order(depths: F32, ids: I64) -> I64:

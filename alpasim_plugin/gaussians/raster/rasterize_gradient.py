@@ -159,13 +159,13 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
         (True, torch.Size([1, 2]))
     """
-    candidates = splats
     if compositor is None:
         with torch.no_grad():
             index = _candidates(splats, camera, near_m)
         candidates = Splats(*(tensor.index_select(0, index) for tensor in splats))
         local = _in_camera(candidates.means, camera)
     else:
+        candidates = splats
         local = _in_camera(splats.means, camera)
         visible = _is_drawn(local, splats, near_m)
         index = torch.arange(len(visible), device=visible.device)
@@ -175,13 +175,7 @@ def rasterize_gradient(
     if uv.requires_grad:
         uv.retain_grad()
     log_opacity = torch.nn.functional.logsigmoid(candidates.logit_opacities)
-    world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
-    terms = sh_terms(*(world * _dot(world, world).rsqrt()))
-    constant, *higher = candidates.sh.unbind(1)
-    colour = 0.5 + C0 * constant
-    for term, coefficients in zip(terms, higher, strict=False):
-        colour = colour + term[:, None] * coefficients
-    projected = (uv, m, n, log_opacity, colour.clamp(min=0), local[2])
+    projected = (uv, m, n, log_opacity, _colours(local, candidates.sh, camera), local[2])
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
         records = _records(*projected, scale)
@@ -200,6 +194,23 @@ def rasterize_gradient(
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return GradientOutput(rgb, alpha, depth, index, uv, on_screen, pairs)
+
+
+def _colours(local: Tensor, sh: Tensor, camera: PinholeCamera) -> Tensor:
+    """Return the colours ``(N, 3)`` from the camera's side, clamped at 0 below.
+
+    Args:
+        local: ``(3, N)`` centres in the camera's frame, metres.
+        sh: ``(N, K, 3)`` harmonic coefficients.
+        camera: From where.
+    """
+    world = upload(camera.T_camera_world[:3, :3].T, local.device).float() @ local
+    terms = sh_terms(*(world * _dot(world, world).rsqrt()))
+    constant, *higher = sh.unbind(1)
+    colour = 0.5 + C0 * constant
+    for term, coefficients in zip(terms, higher, strict=False):
+        colour = colour + term[:, None] * coefficients
+    return colour.clamp(min=0)
 
 
 def rasterize_torch(

@@ -88,13 +88,7 @@ def project_gaussians(
     opacity = opacity[index]
     x, y, z = p.T
 
-    low_x, high_x, low_y, high_y = camera.slope_limits()
-    zero = np.zeros_like(z)
-    rows = (
-        [camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z],
-        [zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z],
-    )
-    jacobian = np.moveaxis(np.array(rows), 2, 0)  # (N, 2, 3)
+    jacobian = _jacobian(p, camera)
     # With rows m, n of M = J R_camera R_q diag(s) the covariance is M M^T and its determinant a sum
     # of squares (Cauchy-Binet), which cannot cancel for needles as C11 C22 - C12^2 does.
     m, n = np.moveaxis(
@@ -122,6 +116,20 @@ def project_gaussians(
         opacity[order],
         sh_colours(cloud.sh[order], direction),
     )
+
+
+def _jacobian(p: F64, camera: PinholeCamera) -> F64:
+    """Return the projection's derivative ``(N, 2, 3)``, pixels a metre, at points ``(N, 3)`` of the
+    camera's frame; slopes beyond the image's surroundings are clamped.
+    """
+    x, y, z = p.T
+    low_x, high_x, low_y, high_y = camera.slope_limits()
+    zero = np.zeros_like(z)
+    rows = (
+        [camera.fx / z, zero, -camera.fx * np.clip(x / z, low_x, high_x) / z],
+        [zero, camera.fy / z, -camera.fy * np.clip(y / z, low_y, high_y) / z],
+    )
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def rasterize_reference(
