@@ -178,11 +178,15 @@ def _with_endings(joined: Summary, runs: Sequence[Run], rollouts: Sequence[Rollo
     """
     outcomes = outcome_table(rollouts)
     for variant, endings in outcomes.items():
-        own = [run.summary.outcomes[variant] for run in runs if variant in run.summary.outcomes]
+        tables = [run.summary.outcomes for run in runs if variant in run.summary.outcomes]
         counts = {}
         for name, events in endings.outcomes.items():
-            parts = [part.outcomes[name].cells for part in own if name in part.outcomes]
-            counts[name] = replace(events, cells=tuple(chain(*parts))[:LISTED])
+            cells = [
+                table[variant].outcomes[name].cells
+                for table in tables
+                if name in table[variant].outcomes
+            ]
+            counts[name] = replace(events, cells=tuple(chain(*cells))[:LISTED])
         outcomes[variant] = replace(endings, outcomes=counts)
     ledgers: dict[str, list[Censoring]] = {}
     for run in runs:

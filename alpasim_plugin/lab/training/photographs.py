@@ -62,9 +62,8 @@ def read_photographs(folder: Path, width: int = 256) -> Photographs:
         )
     _, pictures = read_posed_photographs(folder, "opengl")
     pictures_on_disk, missing = present(folder, pictures)
-    pictures_on_disk = sorted(
-        pictures_on_disk, key=lambda photograph: photograph.camera or ""
-    )  # camera by camera, as files list them
+    # Camera by camera, as files list them.
+    pictures_on_disk = sorted(pictures_on_disk, key=lambda photograph: photograph.camera or "")
     poses = _scaled(np.array([picture.T_world_camera for picture in pictures_on_disk]))
     views = [
         _cut(replace(photograph, T_world_camera=pose).view(), width, photograph.location)

@@ -203,9 +203,8 @@ class PixelTask:
         made, render_psnr = (
             _psnr_db(x, sample.truth) for x in (losses.predictions.detach(), sample.render)
         )
-        degraded = (
-            render_psnr < 40
-        )  # renders that are the truth, or nearly, say nothing about repair
+        # Renders that are the truth, or nearly, say nothing about repair.
+        degraded = render_psnr < 40
         gain = ((made - render_psnr) * degraded).sum() / degraded.sum().clamp(min=1)
         return losses.total, {
             "picture": losses.picture.detach(),

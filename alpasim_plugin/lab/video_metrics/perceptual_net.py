@@ -32,16 +32,16 @@ class FeatureNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        one, two, three, four = WIDTHS
+        first, second, third, fourth = WIDTHS
         self.stages = nn.ModuleList(
             [
-                nn.Sequential(nn.Conv2d(3, one, 4, 2, 1), _activation()),
-                nn.Sequential(nn.Conv2d(one, two, 3, 2, 1), _activation()),
-                nn.Sequential(nn.Conv2d(two, three, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(3, first, 4, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(first, second, 3, 2, 1), _activation()),
+                nn.Sequential(nn.Conv2d(second, third, 3, 2, 1), _activation()),
                 nn.Sequential(
-                    nn.Conv2d(three, four, 3, 2, 1),
+                    nn.Conv2d(third, fourth, 3, 2, 1),
                     _activation(),
-                    nn.Conv2d(four, four, 3, 1, 1),
+                    nn.Conv2d(fourth, fourth, 3, 1, 1),
                     _activation(),
                 ),
             ]
