@@ -150,16 +150,7 @@ class Exchange:
         """
         while (frame := self.bus.recv(0)) is not None:
             self.counts["late"] += bool(self._take(frame, t_us))
-        for sent in self.codec.map.send:
-            if t_us % sent.period_us == 0:
-                try:
-                    self.bus.send(self.codec.encode(sent, quantities))
-                except can.CanError as error:
-                    raise PolicyError(
-                        f"{self.bus.channel_info}: {error}",
-                        "check that the bus is up",
-                    ) from error
-                self.counts["sent"] += 1
+        self._send_due(t_us, quantities)
         began = self.clock()
         waiting = {id(self._steer), id(self._accel)}
         while waiting and (left := began + self.timeout_s - self.clock()) > 0:
@@ -184,6 +175,18 @@ class Exchange:
             ramp = min(accel or 0.0, 0.0) - RAMP_MPS3 * max(over_us, 0) * 1e-6
             accel = max(ramp, STOP_MPS2)
         return Commands(wheel or 0.0, accel or 0.0, mark)
+
+    def _send_due(self, t_us: int, quantities: Mapping[str, float]) -> None:
+        for sent in self.codec.map.send:
+            if t_us % sent.period_us == 0:
+                try:
+                    self.bus.send(self.codec.encode(sent, quantities))
+                except can.CanError as error:
+                    raise PolicyError(
+                        f"{self.bus.channel_info}: {error}",
+                        "check that the bus is up",
+                    ) from error
+                self.counts["sent"] += 1
 
     def facts(self) -> dict[str, Any]:
         """Return counts and latency, for the rollout's manifest."""

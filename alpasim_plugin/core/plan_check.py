@@ -90,7 +90,11 @@ def shape_problem(plan: Any, min_rows: int = 1) -> str:
     far_m = float(np.abs(plan.xy).max(initial=0.0))
     if far_m > REACH_M:
         return f"the plan reaches {far_m:.3g} m, farther than the {REACH_M:g} m of the longest road"
-    samples = getattr(plan, "samples", ())
+    return _samples_problem(getattr(plan, "samples", ()), n)
+
+
+def _samples_problem(samples: Any, n: int) -> str:
+    """Say what keeps the sampled alternatives of a plan of ``n`` poses from being read."""
     if not isinstance(samples, list | tuple):
         return f"samples is {_a(samples)}, not a tuple of arrays"
     for sample in samples:

@@ -159,9 +159,12 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
                 f"{subject}: {name} is {image.dtype} {image.shape}",
                 f"give uint8 {due}, the size of the frame",
             )
-    if frame.pending is not None or frame.alpha is None:
-        return
-    alpha = frame.alpha
+    if frame.pending is None and frame.alpha is not None:
+        _check_alpha(frame.alpha, shape, subject)
+
+
+def _check_alpha(alpha: F32, shape: tuple[int, ...], subject: str) -> None:
+    """Refuse an opacity of another size than the image, or outside of [0, 1]."""
     if alpha.shape != shape[:2]:
         raise InputError(
             f"{subject}: alpha of {alpha.shape} with rgb of {shape[:2]} (height, width)",
@@ -174,6 +177,21 @@ def _check_frame(frame: Frame, sdmap: U8 | None, shape: tuple[int, ...]) -> None
             f"{subject}: opacity from {low:.4g} to {high:.4g}",
             "repair the renderer: its opacity is accumulated alpha, 0 to 1",
         )
+
+
+def _stacked_references(frames: Sequence[Frame], size: tuple[int, int]) -> U8 | None:
+    """Return the references ``(F, K, H, W, 4)`` of frames, zeros where one has fewer than others;
+    None where none has any.
+    """
+    frame_references = [_references(frame) for frame in frames]
+    count = max(map(len, frame_references), default=0)
+    if not count:
+        return None
+    references: U8 = np.zeros((len(frames), count, *size, 4), dtype=np.uint8)
+    for i, images in enumerate(frame_references):
+        for k, image in enumerate(images):
+            references[i, k] = image
+    return references
 
 
 def _stack(
@@ -201,13 +219,8 @@ def _stack(
         import torch
 
         joined = torch.stack
-    frame_references = [] if references is not None else [_references(frame) for frame in frames]
-    count = max(map(len, frame_references), default=0)
-    if count:
-        references = np.zeros((len(frames), count, *shape[:2], 4), dtype=np.uint8)
-        for i, images in enumerate(frame_references):
-            for k, image in enumerate(images):
-                references[i, k] = image
+    if references is None:
+        references = _stacked_references(frames, shape[:2])
     if references is not None:
         references = references.reshape(*lead, *references.shape[1:])
     return Views(

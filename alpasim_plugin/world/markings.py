@@ -6,6 +6,7 @@ it knows. A line that nobody has seen is not drawn. Where the road itself is bui
 markings are a choice, and `with_default_markings` makes it before anything is drawn.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,20 +131,9 @@ def _default(edges: _Edges, i: int) -> LaneMarkType:
     suggest.
     """
     samples = edges.beside(i)
-    for mark_type in (
-        "none",
-        *dict.fromkeys(
-            edge.mark_type for edge in edges.all if edge.mark_type not in ("none", "unknown")
-        ),
-    ):
-        is_marked = [
-            any(
-                edges.all[j].mark_type == mark_type and abs(cosine) > ALONG
-                for j, cosine in neighbours
-            )
-            for neighbours in samples
-        ]
-        if np.mean(is_marked) > COVERED:
+    marked = [edge.mark_type for edge in edges.all if edge.mark_type not in ("none", "unknown")]
+    for mark_type in ("none", *dict.fromkeys(marked)):
+        if _share_along(edges, samples, mark_type) > COVERED:
             return mark_type
     beside = [(edges.all[j], cosine) for neighbours in samples for j, cosine in neighbours]
     shared = sum(other.side == -edges.all[i].side and cosine > ALONG for other, cosine in beside)
@@ -151,6 +141,17 @@ def _default(edges: _Edges, i: int) -> LaneMarkType:
     if max(shared, opposing) < 0.4 * len(samples):
         return "solid_white"
     return "dashed_white" if shared >= opposing else "double_yellow"
+
+
+def _share_along(
+    edges: _Edges, samples: Sequence[Sequence[tuple[int, float]]], mark_type: LaneMarkType
+) -> float:
+    """Return the share of an edge's samples along which an edge of a marking lies."""
+    is_marked = [
+        any(edges.all[j].mark_type == mark_type and abs(cosine) > ALONG for j, cosine in neighbours)
+        for neighbours in samples
+    ]
+    return float(np.mean(is_marked))
 
 
 def _edges_of(lane_map: LaneMap) -> list[_Edge]:

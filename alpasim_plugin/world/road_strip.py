@@ -324,11 +324,9 @@ def build_taper(
     left, centre, right = (
         offset_line(curve, -half - (n - 1 + shift + out) * w) for shift in (0.0, 0.5, 1.0)
     )
-    edge = (
-        offset_line(curve, -half - (n + out) * w - profile.strip_m)
-        if profile.strip_m > 0
-        else right
-    )
+    edge = right
+    if profile.strip_m > 0:
+        edge = offset_line(curve, -half - (n + out) * w - profile.strip_m)
     lines = make_lines(curve, profile)
     extra = n if kind == "merge" else n - 1
     for key, point in joint.items():
@@ -345,17 +343,16 @@ def build_taper(
     strip = _add_lanes(draft, name, lines, profile)
     outermost = draft.lanes[strip.forward[-1]]  # the slanting lane crosses its edge
     draft.lanes[outermost.lane_id] = replace(outermost, right_mark_type="dashed_white")
-    slant = draft.add(
-        Lane(
-            f"{name}_{kind}",
-            centre,
-            left,
-            right,
-            left_mark_type="none",
-            right_mark_type=profile.edge_mark_type,
-            speed_limit_mps=profile.speed_limit_mps,
-        )
+    slanting_lane = Lane(
+        f"{name}_{kind}",
+        centre,
+        left,
+        right,
+        left_mark_type="none",
+        right_mark_type=profile.edge_mark_type,
+        speed_limit_mps=profile.speed_limit_mps,
     )
+    slant = draft.add(slanting_lane)
     add_sides(draft, name, {**lines, f"f{n}": right, "right": edge}, profile)
     end_lines = {**lines, "right": edge}
     if kind == "split":

@@ -6,6 +6,7 @@ Junctions have arms, turning lanes, kerbs, crosswalks and stop lines.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -48,15 +49,8 @@ class Arm:
     into: tuple[str, ...]
 
 
-def _grow_intersection(
-    draft: MapDraft, name: str, following: str, tip: _Tip, element: Intersection
-) -> Stretch:
-    """Add a junction at the end of the road; ``following`` is the name of the strip that will leave
-    it.
-
-    Raises:
-        InputError: There is no road before it, or the main road leaves by an arm that is not there.
-    """
+def _check_intersection(name: str, tip: _Tip, element: Intersection) -> None:
+    """Refuse a junction behind a junction, and a turn into an arm that is not there."""
     if tip.after_junction:
         raise InputError(
             f"{name}: two intersections without a road between them",
@@ -67,6 +61,42 @@ def _grow_intersection(
             f"{name}: turn: {element.turn}, but the arms are {', '.join(element.arms)}",
             "add that arm",
         )
+
+
+def _connect(
+    draft: MapDraft, name: str, arms: Sequence[Arm], turn: str
+) -> tuple[dict[int, tuple[str, int]], dict[int, str]]:
+    """Add the lanes inside a junction.
+
+    Returns:
+        Of the main road, which leaves by the arm ``turn``: for each lane that arrives the lane
+        inside and the number of the lane that it leads to, and for each oncoming lane behind the
+        junction the lane inside.
+    """
+    forward = {}
+    backward = {}
+    for a, b in itertools.product(arms, arms):
+        for i, j in _movements(a, b):
+            lane = draft.add(_connector(name, a, b, i, j))
+            draft.link(a.into[i], lane)
+            draft.link(lane, b.out[j])
+            if (a.name, b.name) == ("entry", turn):
+                forward[i] = lane, j
+            if (a.name, b.name) == (turn, "entry"):
+                backward[j] = lane
+    return forward, backward
+
+
+def _grow_intersection(
+    draft: MapDraft, name: str, following: str, tip: _Tip, element: Intersection
+) -> Stretch:
+    """Add a junction at the end of the road; ``following`` is the name of the strip that will leave
+    it.
+
+    Raises:
+        InputError: There is no road before it, or the main road leaves by an arm that is not there.
+    """
+    _check_intersection(name, tip, element)
     profile = tip.profile
     side = replace(
         profile,
@@ -103,18 +133,7 @@ def _grow_intersection(
             arms.append(
                 Arm(turn, heading, side, strip.joint(at_end=False), strip.forward, strip.backward)
             )
-    forward = {}
-    backward = {}
-    for a in arms:
-        for b in arms:
-            for i, j in _movements(a, b):
-                lane = draft.add(_connector(name, a, b, i, j))
-                draft.link(a.into[i], lane)
-                draft.link(lane, b.out[j])
-                if a.name == "entry" and b.name == element.turn:
-                    forward[i] = lane, j
-                if a.name == element.turn and b.name == "entry":
-                    backward[j] = lane
+    forward, backward = _connect(draft, name, arms, element.turn)
     _kerbs(draft, arms)
     _mark_type(draft, element, arms, [lane for lane, _ in forward.values()])
     tip.forward, tip.backward, tip.after_junction = (), (), True

@@ -70,12 +70,7 @@ def parse_renderer(text: str) -> RendererName:
     """
     match = _FIXER.fullmatch(text)
     if match is None:
-        alone = _ALONE.fullmatch(text)
-        if alone is None:
-            if "://" not in text and ("[" in text or "]" in text):
-                raise _no_settings(text)
-            return RendererName(text)
-        return RendererName(alone["part"], _steps(alone), _settings(alone["settings"], text))
+        return _without_base(text)
     base = match["base"]
     steps = _steps(match)
     settings = _settings(match["settings"], text)
@@ -86,9 +81,24 @@ def parse_renderer(text: str) -> RendererName:
         base = end["base"]
         steps = steps or _steps(end)
         settings = settings or _settings(end["settings"], text)
-    if "://" not in base and ("[" in base or "]" in base):
+    if _has_stray_bracket(base):
         raise _no_settings(text)
     return RendererName(match["part"], steps, settings, base)
+
+
+def _without_base(text: str) -> RendererName:
+    """Parse the name of one renderer, or of a fixer over the usual one."""
+    match = _ALONE.fullmatch(text)
+    if match is not None:
+        return RendererName(match["part"], _steps(match), _settings(match["settings"], text))
+    if _has_stray_bracket(text):
+        raise _no_settings(text)
+    return RendererName(text)
+
+
+def _has_stray_bracket(text: str) -> bool:
+    """Tell whether a name that should have no settings has brackets; addresses may."""
+    return "://" not in text and ("[" in text or "]" in text)
 
 
 def _steps(match: re.Match[str]) -> str:

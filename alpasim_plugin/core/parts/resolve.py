@@ -229,6 +229,12 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
     fixer = resolve("fixer", front, (*overrides_of(name, overrides), *bracket_settings))
     if bracket_settings:
         fixer = replace(fixer, name=f"{fixer.name}[{','.join(bracket_settings)}]")
+    _check_in_loop(fixer)
+    return RendererSpec(name, resolve("renderer", base or BASE), fixer)
+
+
+def _check_in_loop(fixer: PartSpec) -> None:
+    """Refuse a fixer of whole clips, and one without the weights that it needs."""
     settings: Any = fixer.settings
     if getattr(settings, "is_offline", False):
         raise InputError(
@@ -238,7 +244,6 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         )
     if fixer.missing:
         raise InputError(f"fixer {fixer.name!r}: {fixer.note}", fixer.missing)
-    return RendererSpec(name, resolve("renderer", base or BASE), fixer)
 
 
 def _is_renderer(name: str) -> bool:
@@ -346,18 +351,27 @@ def _declares_nothing(kind: KindName, target: str) -> bool:
     )
 
 
-def _described(spec: PartSpec, factory: Any) -> PartSpec:
+def _modules_of(spec: PartSpec, factory: Any) -> list[Path]:
+    """Return the files of the modules that define a part; more follow by their imports."""
     module = file_of(spec.target)
     modules = [] if module is None else [module]
     if inspect.isclass(factory) or inspect.isfunction(factory):
-        # a package may only pass on what another module defines
+        # A package may only pass on what another module defines.
         home = getattr(sys.modules.get(factory.__module__), "__file__", None)
-        modules += [Path(home)] if home is not None and Path(home) not in modules else []
+        if home is not None and Path(home) not in modules:
+            modules.append(Path(home))
     mode = installed(MODES).get(str(getattr(spec.settings, "loop_mode", "")))
     mode_file = None if mode is None else file_of(mode.value)
     if mode_file is not None:
-        # what calls a fixer of blocks shapes its frames, and no import leads there
+        # What calls a fixer of blocks shapes its frames, and no import leads there.
         modules.append(mode_file)
+    return modules
+
+
+def _described(spec: PartSpec, factory: Any) -> PartSpec:
+    """Return a part with what its factory declares: files, digest, note and the like."""
+    module = file_of(spec.target)
+    modules = _modules_of(spec, factory)
     if factory is not None:
         for file in modules:
             require_unedited(file)

@@ -118,22 +118,9 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     outlines += [(name, line) for name, _, line in lines]
     outlines += [("crosswalk", ring) for ring in lane_map.crosswalks]
     for name, outline in outlines:
-        if outline.ndim != 2 or outline.shape[1] != 3:
-            raise InputError(
-                f"{name}: an array of shape {outline.shape}", "give points (N, 3), metres, world"
-            )
-        if not np.isfinite(outline).all():
-            bad_point = int(np.flatnonzero(~np.isfinite(outline).all(axis=1))[0])
-            raise InputError(
-                f"{name}: point {bad_point} is {outline[bad_point].tolist()}",
-                "repair or drop this line",
-            )
+        _check_outline(name, outline)
     for pose, box in lane_map.signs:
-        require_rigid(pose, "sign")
-        if not np.isfinite(box.size_m).all() or min(box.size_m) < 0:
-            raise InputError(
-                f"sign: a box of {box.size_m} m", "give finite sizes, length, width and height"
-            )
+        _check_sign(pose, box)
     points = [outline for _, outline in outlines] + [
         pose[None, :3, 3] for pose, _ in lane_map.signs
     ]
@@ -158,6 +145,29 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
     is_closed = np.zeros(len(triangles), dtype=bool)
     filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
     return PreparedMap(origin, _segments(pieces), filled)
+
+
+def _check_outline(name: str, outline: F64) -> None:
+    """Refuse a line or an area whose points are not finite ``(N, 3)``."""
+    if outline.ndim != 2 or outline.shape[1] != 3:
+        raise InputError(
+            f"{name}: an array of shape {outline.shape}", "give points (N, 3), metres, world"
+        )
+    if not np.isfinite(outline).all():
+        bad_point = int(np.flatnonzero(~np.isfinite(outline).all(axis=1))[0])
+        raise InputError(
+            f"{name}: point {bad_point} is {outline[bad_point].tolist()}",
+            "repair or drop this line",
+        )
+
+
+def _check_sign(pose: F64, box: Box) -> None:
+    """Refuse a sign whose pose is not rigid or whose size cannot be."""
+    require_rigid(pose, "sign")
+    if not np.isfinite(box.size_m).all() or min(box.size_m) < 0:
+        raise InputError(
+            f"sign: a box of {box.size_m} m", "give finite sizes, length, width and height"
+        )
 
 
 def _pole(line: F64) -> F64:
