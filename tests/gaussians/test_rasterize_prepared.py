@@ -183,6 +183,47 @@ def test_read_only_and_strided_inputs_meet_the_kernels_that_are_already_compiled
     assert len(composite_tiles.signatures) == compiled
 
 
+@pytest.mark.parametrize("bits", [1, 8, 11, 12, 23, 31])
+def test_the_order_by_depth_is_that_of_a_sort_by_depth_and_identity(bits):
+    """Few bits give many equal depths, many bits several passes of the sort."""
+    rng = np.random.default_rng(bits)
+    keys = rng.integers(0, min(2**bits, 0x7F000000), 5000).astype(np.int32)
+    depths = keys.view(np.float32)
+    ids = rng.permutation(5000) * 7
+    expected = np.lexsort((ids, keys))
+    np.testing.assert_array_equal(cpu.depth_order(depths, ids), expected)
+
+
+def test_one_splat_and_none_have_an_order():
+    none = cpu.depth_order(np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.int64))
+    assert none.shape == (0,)
+    single = cpu.depth_order(np.float32([3.5]), np.array([9]))
+    assert single.tolist() == [0]
+
+
+def test_a_background_is_blended_as_array_arithmetic_does(monkeypatch):
+    """The kernel that blends it rounds as a multiplication, an addition and a division each do."""
+    scene = prepare(driving_like_scene(2500, seed=5))
+    cam = driving_camera(90, 50)
+    behind = np.random.default_rng(1).random((50, 90, 3), dtype=np.float32)
+    sums = []
+
+    def without(tiles, records, kept, behind, camera, threads):
+        sums.append(composite(tiles, records, kept, None, camera, threads))
+        return composite(tiles, records, kept, behind, camera, threads)
+
+    composite = cpu.composite
+    monkeypatch.setattr(cpu, "composite", without)
+    for background in (behind, (0.2, 0.9, 1.5)):
+        out = rasterize_prepared([(scene, None)], cam, background, threads=1)
+        colour, alpha, depth_sum = sums.pop()
+        blended = colour + (1 - alpha[..., None]) * np.float32(background)
+        depth = np.divide(depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        np.testing.assert_array_equal(out.rgb, np.clip(blended, 0, 1))
+        np.testing.assert_array_equal(out.alpha, alpha)
+        np.testing.assert_array_equal(out.depth, depth)
+
+
 def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monkeypatch):
     """Same arithmetic with all culling switched off: what the tiles and blocks skip is exactly what
     the alpha cut would skip.
@@ -198,9 +239,8 @@ def test_tiles_and_blocks_change_no_bit_against_every_splat_on_every_pixel(monke
         table[:, [RADIUS_X, RADIUS_Y, BLOCK_REACH]] = 1e30
         n_tiles = len(starts) - 1
         full = np.tile(seen["order"].astype(np.int32), n_tiles)
-        composite_tiles(
-            cursor, tiles_x, np.arange(n_tiles + 1) * count, full, table.reshape(-1), *images
-        )
+        starts = np.arange(n_tiles + 1) * count
+        composite_tiles(cursor, tiles_x, starts, full, table.reshape(-1), *images)
 
     def ordered(*args):
         seen["order"] = depth_order(*args)

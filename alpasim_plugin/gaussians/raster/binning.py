@@ -15,6 +15,49 @@ from alpasim_plugin.core.kernels import inlined_kernel, kernel
 from alpasim_plugin.gaussians.constants import RADIUS_X, RADIUS_Y, RECORD, TILE, U, V
 from alpasim_plugin.gaussians.raster import simd as v
 
+RADIX_BITS = 11  # most of a key that a pass of the sort looks at: its counts stay in the cache
+LOW_HALF = np.int64(0xFFFFFFFF)
+
+
+@kernel
+def sorted_pairs(keys, width):
+    """Return keys with their numbers, ``key << 32 | number``, by key, equal ones by number; and
+    whether two keys are equal.
+
+    A radix sort, which takes a third of the time of a sort by comparisons.
+
+    Args:
+        keys: int32 ``(N,)``, not negative.
+        width: Bits of the largest.
+    """
+    passes = max(1, (width + RADIX_BITS - 1) // RADIX_BITS)
+    bits = max(1, (width + passes - 1) // passes)
+    size = 1 << bits
+    source = np.empty(keys.shape[0], dtype=np.int64)
+    target = np.empty(keys.shape[0], dtype=np.int64)
+    places = np.zeros((passes, size), dtype=np.int64)
+    for i in range(keys.shape[0]):
+        key = np.int64(keys[i])
+        source[i] = (key << 32) | i
+        for step in range(passes):
+            places[step, (key >> (step * bits)) & (size - 1)] += 1
+    for step in range(passes):
+        total = 0
+        for digit in range(size):
+            count = places[step, digit]
+            places[step, digit] = total
+            total += count
+        shift = 32 + step * bits
+        for i in range(keys.shape[0]):
+            digit = (source[i] >> shift) & (size - 1)
+            target[places[step, digit]] = source[i]
+            places[step, digit] += 1
+        source, target = target, source
+    has_ties = False
+    for i in range(1, keys.shape[0]):
+        has_ties |= (source[i] >> 32) == (source[i - 1] >> 32)
+    return source, has_ties
+
 
 @inlined_kernel
 def _tile_span(centre, radius, n_tiles):
@@ -48,8 +91,8 @@ def tile_boxes(records, tiles_x, tiles_y, boxes):
 
 
 @kernel
-def count_tiles(cursor, chunk_size, order, boxes, changes):
-    """Count, per chunk of ``chunk_size`` splats in the order of depth, how many meet each tile.
+def count_tiles(cursor, chunk_size, boxes, changes):
+    """Count, per chunk of ``chunk_size`` boxes in the order of depth, how many meet each tile.
 
     ``changes`` has a row and a column more than the tiles. Its sums along both are the counts,
     since a box adds one at its first corner and takes it off past its ends.
@@ -60,8 +103,7 @@ def count_tiles(cursor, chunk_size, order, boxes, changes):
             return
         corners = changes[chunk]
         corners[:] = 0
-        for splat in order[chunk * chunk_size : (chunk + 1) * chunk_size]:
-            left, right, top, bottom = boxes[splat]
+        for left, right, top, bottom in boxes[chunk * chunk_size : (chunk + 1) * chunk_size]:
             corners[top, left] += 1
             corners[top, right] -= 1
             corners[bottom, left] -= 1
@@ -79,8 +121,9 @@ def fill_tiles(cursor, chunk_size, order, boxes, tiles_x, position, lists):
         if chunk >= position.shape[0]:
             return
         next_place = position[chunk]
-        for splat in order[chunk * chunk_size : (chunk + 1) * chunk_size]:
-            left, right, top, bottom = boxes[splat]
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, order.shape[0])):
+            splat = order[rank]
+            left, right, top, bottom = boxes[rank]
             for row in range(top, bottom):
                 for tile in range(row * tiles_x + left, row * tiles_x + right):
                     lists[next_place[tile]] = splat

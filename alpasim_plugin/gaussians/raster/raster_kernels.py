@@ -219,8 +219,10 @@ def composite_tile(lists, start, end, records, x0, y0, state, live, kept, kept_a
 
 
 @kernel
-def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha, depth_sum):
-    """Render tiles until none is left, without background; called by each thread.
+def composite_tiles(
+    cursor, tiles_x, starts, lists, records, kept, behind, colour, alpha, depth_sum
+):
+    """Render tiles until none is left; called by each thread.
 
     Args:
         cursor: int64 ``(1,)``, the next tile; shared by all threads.
@@ -229,9 +231,12 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
         lists: Records per tile, nearest first.
         records: Projected splats.
         kept: float32 output, 16 x KEPT per tile, for `gradient_kernels.tile_gradients`, or None.
-        colour: float32 output ``(H, W, 3)``, sum of weighted colours.
+        behind: float32 ``(H, W, 3)`` or ``(1, 1, 3)``, the background; or None.
+        colour: float32 output ``(H, W, 3)``, sum of weighted colours; with a background what is
+            seen, clamped to 0..1.
         alpha: float32 output ``(H, W)``.
-        depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres.
+        depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres; with a background
+            their mean, 0 where alpha is 0.
     """
     state = np.empty(16 * STATE, np.float32)
     near = np.empty(CHUNK * RECORD, np.float32)
@@ -259,7 +264,16 @@ def composite_tiles(cursor, tiles_x, starts, lists, records, kept, colour, alpha
             for column in range(min(TILE, width - tile_x * TILE)):
                 x = tile_x * TILE + column
                 offset = ((row >> 2) * 4 + (column >> 2)) * STATE + (row & 3) * 4 + (column & 3)
-                alpha[y, x] = _f(1.0) - abs(state[offset + STATE_T])
-                depth_sum[y, x] = state[offset + STATE_D]
+                opacity = _f(1.0) - abs(state[offset + STATE_T])
+                alpha[y, x] = opacity
+                depth = state[offset + STATE_D]
+                if behind is not None:
+                    depth = depth / opacity if opacity > 0 else _f(0.0)
+                depth_sum[y, x] = depth
                 for channel in range(3):
-                    colour[y, x, channel] = state[offset + STATE_R + 16 * channel]
+                    light = state[offset + STATE_R + 16 * channel]
+                    if behind is not None:
+                        back = behind[min(y, behind.shape[0] - 1), min(x, behind.shape[1] - 1)]
+                        light = light + (_f(1.0) - opacity) * back[channel]
+                        light = min(max(light, _f(0.0)), _f(1.0))
+                    colour[y, x, channel] = light

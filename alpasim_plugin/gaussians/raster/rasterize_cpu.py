@@ -34,7 +34,13 @@ from alpasim_plugin.gaussians.constants import (
     TILE,
     Z,
 )
-from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, tile_boxes
+from alpasim_plugin.gaussians.raster.binning import (
+    LOW_HALF,
+    count_tiles,
+    fill_tiles,
+    sorted_pairs,
+    tile_boxes,
+)
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import project_part
@@ -100,10 +106,7 @@ def rasterize_prepared(
 
     order = depth_order(records[Z : count * RECORD : RECORD], ids[:count])
     tiles = list_per_tile(order, records, camera, threads)
-    colour, alpha, depth_sum = composite(tiles, records, None, camera, threads)
-    rgb = np.clip(colour + (1 - alpha[..., None]) * behind, 0, 1)
-    depth = np.divide(depth_sum, alpha, out=np.zeros_like(alpha), where=alpha > 0)
-    return RasterOutput(rgb, alpha, depth)
+    return RasterOutput(*composite(tiles, records, None, behind, camera, threads))
 
 
 def _write_motion(
@@ -126,7 +129,17 @@ def depth_order(depths: F32, ids: I64) -> I64:
     Bits of depths sort as the depths do, which are not negative. The result does not depend on the
     order in which threads wrote the records.
     """
-    return np.argsort(depths.view(np.int32).astype(np.int64) << 32 | ids)
+    bits = depths.view(np.int32)
+    keys = bits - bits.min(initial=np.iinfo(np.int32).max)
+    pairs, has_ties = sorted_pairs(keys, int(keys.max(initial=0)).bit_length())
+    order = np.asarray(pairs & LOW_HALF, np.int64)
+    if has_ties:
+        is_like_next = np.diff(pairs >> 32) == 0
+        tied = np.flatnonzero(np.r_[is_like_next, False] | np.r_[False, is_like_next])
+        splats = order[tied]
+        # Equal depths lie side by side, so the tied ones alone, sorted again, fill their places.
+        order[tied] = splats[np.lexsort((ids[splats], keys[splats]))]
+    return order
 
 
 def camera_numbers(camera: PinholeCamera) -> F32:
@@ -167,33 +180,41 @@ def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int)
     # At most 64 chunks of at least 8192 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(8192, -(-count // 64))
-    boxes = np.empty((count, 4), dtype=np.int16)
-    tile_boxes(records, tiles_x, tiles_y, boxes)
+    by_record = np.empty((count, 4), dtype=np.int16)
+    tile_boxes(records, tiles_x, tiles_y, by_record)
+    # A box is eight bytes, which are moved at once.
+    boxes = by_record.view(np.int64)[order].view(np.int16)
     changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), dtype=np.int32)
     workers = min(threads, max(1, len(changes) // 4))  # a millisecond of work for each
-    chunks = (np.zeros(1, dtype=np.int64), chunk_size, order, boxes)
-    run_on_threads(workers, count_tiles, *chunks, changes)
+    cursor = np.zeros(1, dtype=np.int64)
+    run_on_threads(workers, count_tiles, cursor, chunk_size, boxes, changes)
     counts = changes.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1, tiles_x * tiles_y)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts
     lists = np.empty(starts[-1], dtype=np.int32)
-    chunks[0][:] = 0
+    cursor[:] = 0
+    chunks = (cursor, chunk_size, order, boxes)
     run_on_threads(workers, fill_tiles, *chunks, tiles_x, starts[:-1] + before, lists)
     return TileLists(tiles_x, starts, lists)
 
 
 def composite(
-    tiles: TileLists, records: F32, kept: F32 | None, camera: PinholeCamera, threads: int
+    tiles: TileLists,
+    records: F32,
+    kept: F32 | None,
+    behind: F32 | None,
+    camera: PinholeCamera,
+    threads: int,
 ) -> tuple[F32, F32, F32]:
-    """Return the sums of weighted colours ``(H, W, 3)``, alpha ``(H, W)`` and the sums of weighted
-    depths ``(H, W)``, metres, all without background; ``kept`` is that of `composite_tiles`.
+    """Return the image ``(H, W, 3)``, alpha ``(H, W)`` and depth ``(H, W)``, metres, before a
+    background; without one the sums of weighted colours and depths. See `composite_tiles`.
     """
     shape = (camera.height, camera.width)
     colour = np.empty((*shape, 3), dtype=np.float32)
     alpha = np.empty(shape, dtype=np.float32)
     depth_sum = np.empty(shape, dtype=np.float32)
     lists = (np.zeros(1, dtype=np.int64), tiles.columns, tiles.starts, tiles.lists, records)
-    run_on_threads(threads, composite_tiles, *lists, kept, colour, alpha, depth_sum)
+    run_on_threads(threads, composite_tiles, *lists, kept, behind, colour, alpha, depth_sum)
     return colour, alpha, depth_sum
 
 

@@ -367,7 +367,7 @@ def _on_cpu(records: Tensor, camera: PinholeCamera, threads: int) -> tuple[Image
     tiles = list_per_tile(np.arange(len(records)), flat, camera, threads)
     kept = np.empty((len(tiles.starts) - 1) * 16 * KEPT, dtype=np.float32)
     colour, alpha, depth = (
-        torch.from_numpy(image) for image in composite(tiles, flat, kept, camera, threads)
+        torch.from_numpy(image) for image in composite(tiles, flat, kept, None, camera, threads)
     )
 
     def sums(*gradients: Tensor) -> Tensor:
