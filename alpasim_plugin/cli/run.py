@@ -1,7 +1,6 @@
 """``simrun [run]``: drive scenarios behind renderers and tabulate the results."""
 
 import os
-import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -43,6 +42,7 @@ from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
+from alpasim_plugin.runs.shards import shard_of
 from alpasim_plugin.runs.vary import BoundarySearch, Sweep, parse_sweeps
 from evaluators import preset as find_preset
 from evaluators.pages.decision import decision_lines
@@ -342,23 +342,6 @@ def distinct(refs: Iterable[ScenarioRef]) -> list[ScenarioRef]:
     for ref in refs:
         scenes.setdefault(replace(ref, path=os.path.realpath(ref.path)), ref)
     return [*scenes.values()]
-
-
-def shard_of(refs: Sequence[ScenarioRef], shard: str) -> list[ScenarioRef]:
-    """Return every N-th scene, from the I-th on, for a shard ``I/N``.
-
-    Raises:
-        InputError: ``shard`` is not I/N with 1 <= I <= N, or there are fewer than I scenes.
-    """
-    match = re.fullmatch(r"([0-9]+)/([0-9]+)", shard)
-    number, count = (int(match[1]), int(match[2])) if match else (0, 0)
-    if not 1 <= number <= count:
-        raise InputError(f"--shard {shard}: not I/N with 1 <= I <= N", "Write for example 3/16.")
-    if number > len(refs):
-        raise InputError(
-            f"--shard {shard}: there are only {len(refs)} scenes", "Use at most as many shards."
-        )
-    return list(refs[number - 1 :: count])
 
 
 def question_of(metrics: Sequence[str]) -> Question:

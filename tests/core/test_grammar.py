@@ -2,14 +2,12 @@
 taken for one of the grammar.
 """
 
-import json
 import os
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.cli.options import split_overrides
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import resolve, split_names
@@ -96,23 +94,3 @@ def test_a_file_behind_a_link_and_a_plus_in_its_folder_is_a_part(tmp_path):
     code = resolve("policy", f"{tmp_path / 'link.py'}:Mine").code
     assert {os.path.basename(path) for path in code} == {"mine.py", "helper_behind_a_link.py"}
     assert parse_renderer(f"{folder}/mine.py:Mine").base == ""
-
-
-SCENE = """version: 1
-road: {segments: [{kind: straight, length_m: 200}]}
-"""
-
-
-def test_a_scene_that_two_arguments_name_is_in_one_shard_of_four(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for name in "abcde":
-        (tmp_path / f"{name}.yaml").write_text(SCENE)
-    (tmp_path / "suite.yaml").write_text("version: 1\nscenarios: [a.yaml, d.yaml, e.yaml]\n")
-    os.symlink(tmp_path, tmp_path / "link")
-    scenes = []
-    for shard in range(1, 5):
-        command = ["--renderer", "clean", "--policy", "constant-velocity", "--dry-run", "--json"]
-        places = ["a.yaml", "./b.yaml", "link/c.yaml", str(tmp_path / "d.yaml"), "suite.yaml"]
-        assert run_command([*command, "--shard", f"{shard}/4", *places]) == 0
-        scenes += json.loads(capsys.readouterr().out)["scenes"]
-    assert sorted(name.rpartition("-")[2] for name in scenes) == ["a", "b", "c", "d", "e"]
