@@ -139,11 +139,10 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         box = boxes.ray[i], boxes.eye[i], boxes.walls[i], to_then[i], boxes.pixels[i]
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
-    # What lies outside is not looked up; the margin gives all that is inside its neighbours.
+    # Places outside are far off, and black; the margin gives all that is inside its neighbours.
     margin = (TAPS,) * 4
     then = cv2.copyMakeBorder(recorded.rgb, *margin, cv2.BORDER_REPLICATE)
-    rgb = np.zeros((*shape, 3), np.uint8)
-    cv2.remap(then, x, y, cv2.INTER_CUBIC, dst=rgb, borderMode=cv2.BORDER_TRANSPARENT)
+    rgb = cv2.remap(then, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
     out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
     step = max(1, shape[1] // SEARCHED)
     coarse = slice(0, None, step)
