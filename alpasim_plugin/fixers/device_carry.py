@@ -266,6 +266,7 @@ def _warp(
         recorded.rgb, grid[:, None].float(), "bicubic", padding_mode="border", align_corners=True
     )
     levels = (sampled[:, :, 0].mT + 0.5).clamp(0, 255)
+    levels = levels * inside_image[..., None]  # black where no frame shows anything, as on the host
     out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
     return out.view(len(depth), -1, *out.shape[1:])
 
