@@ -389,6 +389,12 @@ class Observation:
 
         return torch.tensor(self.frames[camera].rgb)
 
+    def with_frames(self, frames: Mapping[str, Frame]) -> Observation:
+        """Return the observation with other frames, in `image` as well: what a device holds of the
+        former frames is dropped.
+        """
+        return replace(self, frames=frames, images={})
+
 
 @dataclass(frozen=True)
 class Plan:

@@ -26,7 +26,7 @@ class BlackLeft(LearnedThree):
         camera = self.cameras[names.index(self.view)].name
         frame = observation.frames[camera]
         black = replace(frame, rgb=np.zeros_like(frame.rgb))
-        return super().act(replace(observation, frames={**observation.frames, camera: black}))
+        return super().act(observation.with_frames({**observation.frames, camera: black}))
 
 
 class BlackRight(BlackLeft):

@@ -2,10 +2,16 @@
 black.
 """
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
+import torch
 import yaml
 
 from alpasim_plugin import make_renderer, run_rollout
+from alpasim_plugin.core.geometry import trajectory_from_poses
+from alpasim_plugin.core.types import EgoState, Frame, Observation
 from alpasim_plugin.lab.bench.black_camera import BlackLeft, BlackRight
 from evaluators import contact_events
 from policies.learned import LearnedThree
@@ -41,6 +47,34 @@ def row_of_cars(side):
         points = [[t, x_m, down * SPEED_MPS * (t - arrives_s), down * 1.5708] for t in (0.0, 20.0)]
         spec["actors"].append({"kind": "logged", "id": f"crosses-{i}", "points": points})
     return spec
+
+
+def test_the_policy_is_handed_a_black_image_of_its_camera_alone(tmp_path, monkeypatch):
+    """Images that lie on a device beside the frames are black as well."""
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(row_of_cars("left")))
+    scenario = load_scenario(path)
+    observations = []
+    monkeypatch.setattr(
+        LearnedThree, "act", lambda policy, observation: observations.append(observation)
+    )
+    policy = BlackLeft(scenario, temperature=0.0)
+    names = [sensor.camera for sensor in policy.sensors]
+    grey = np.full((4, 6, 3), 90, np.uint8)
+    state = EgoState(0, np.eye(4), 5.0)
+    observation = Observation(
+        0,
+        {name: Frame(0, name, grey) for name in names},
+        {camera.name: camera for camera in scenario.cameras},
+        state,
+        trajectory_from_poses([0], state.T_world_rig[None]),
+        np.full((20, 3), np.nan),
+    )
+    policy.act(observation)
+    policy.act(replace(observation, images={name: torch.tensor(grey) for name in names}))
+    for received in observations:
+        levels = {name: int(received.image(name).max()) for name in names}
+        assert levels == {name: 0 if name == "left" else 90 for name in names}
 
 
 @pytest.mark.slow
