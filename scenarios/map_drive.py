@@ -40,7 +40,8 @@ REAR_M = 2.0  # room behind the rear axle where the map begins
 AHEAD_M = 120.0  # the route goes on so far behind the end of the drive
 AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
 DRIVEN_GAP_M = 1.0  # links across wider gaps are not driven
-LONGEST_S = 300.0  # of a drive
+LONGEST_S = 300.0  # of a drive on a short route
+LONGEST_SHARE = 3.0  # of the time that a long route takes at the cruising speed
 MOST_INSIDE_M = 0.6  # in bends: from the middle of the lane
 EASED_M = 1.5  # length over which that offset is smoothed
 YELLOW_AHEAD_S = 4.0  # before the ego, on a free road, would pass the first light of its route
@@ -85,7 +86,7 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         spec.ego,
         walkers,
         followers,
-        _end_us(draft),
+        _end_us(draft, driven.length_m),
         lane_map.signals,
         lane_map.give_way,
         graph.limits_mps(way, driven),
@@ -115,11 +116,14 @@ def _read_street(draft: SceneDraft, spec: MapSpec, files: SourceFiles) -> Street
         return READERS[kind](files, path)
 
 
-def _end_us(draft: SceneDraft) -> int:
-    """Return the last time of the drive: the duration that the file states, or the longest."""
+def _end_us(draft: SceneDraft, route_m: float) -> int:
+    """Return the last time of the drive: the duration that the file states, or the longest that a
+    route of so many metres may take.
+    """
     timing = draft.spec.timing
     if timing.duration_us is None:
-        return round(LONGEST_S * 1e6)
+        free_drive_s = route_m / draft.spec.ego.cruise_mps
+        return round(max(LONGEST_S, LONGEST_SHARE * free_drive_s) * 1e6)
     return timing.start_us + timing.start_time_offset_us + timing.duration_us
 
 
@@ -156,7 +160,7 @@ def _traffic(
         front_m,
         draft.spec.ego.cruise_mps,
         spec.pedestrians,
-        grid(_end_us(draft)),
+        grid(_end_us(draft, driven.length_m)),
         stream(draft.scene_id, draft.spec.seed, "scenario/map/pedestrians"),
     )
     return followers, walkers
@@ -187,38 +191,77 @@ def _up_to_goal(line: Path, goal_m: float, driven: F64) -> F64:
 def _way(draft: SceneDraft, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:
     """Return the route: between two places, or with an end that is drawn."""
     named = spec.route if isinstance(spec.route, MapRoute) else MapRoute()
-    starts, goals = (
-        None if text is None else _spots(text, graph, street) for text in (named.from_, named.to)
-    )
+    places = [_spots(text, graph, street) for text in (named.from_, *named.via, named.to) if text]
     rng = stream(draft.scene_id, draft.spec.seed, "scenario/map/route")
-    best: Way | None = None
-    longest_m = 0.0
+    if named.from_ is not None and named.to is not None:
+        return _between(graph, named, places)
+    ways = []
     for _ in range(DRAWS):
-        begin = starts or [graph.drawn_spot(rng)]
-        if goals is not None:
-            way = graph.between(begin, goals)
-            if way is not None:
-                return way
-            if starts is not None:
-                raise InputError(
-                    f"no way along the lanes from {named.from_} to {named.to}",
-                    "choose a place that lanes lead to, or exchange the two",
-                )
+        begin = [] if named.from_ is not None else [[graph.drawn_spot(rng)]]
+        way = _drawn(graph, [*begin, *places], named, rng)
+        if way is None:
             continue
-        spot = begin[int(rng.integers(len(begin)))]
-        way = graph.drawn(spot, ROUTE_M, rng)
-        length_m = graph.driven_m(way)
-        if length_m > longest_m:
-            best = way
-            longest_m = length_m
-        if length_m >= ROUTE_M:
-            break
-    if best is None or longest_m < SHORTEST_ROUTE_M:
+        ways.append(way)
+        if named.to is not None or graph.driven_m(way) >= (named.length_m or ROUTE_M):
+            return way
+    return _longest(graph, ways, named.length_m)
+
+
+def _between(graph: LaneGraph, named: MapRoute, places: Sequence[Sequence[Spot]]) -> Way:
+    """Return the shortest way between the named ends through the places between."""
+    way = _shortest(graph, places)
+    if way is None:
+        passed = "".join(f" through {text}" for text in named.via)
         raise InputError(
-            f"no route of {SHORTEST_ROUTE_M:.0f} m in {DRAWS} draws",
+            f"no way along the lanes from {named.from_} to {named.to}{passed}",
+            "choose a place that lanes lead to, or exchange the two",
+        )
+    if len(set(way.lane_ids)) < len(way.lane_ids):
+        raise InputError(
+            f"the way from {named.from_} to {named.to} passes a lane twice",
+            "choose places in map.route.via that lie along one way",
+        )
+    return way
+
+
+def _shortest(graph: LaneGraph, places: Sequence[Sequence[Spot]]) -> Way | None:
+    """Return the shortest way through places; None where no lanes lead through them."""
+    if len(places) == 2:
+        return graph.between(*places)
+    return min(graph.through(places), key=graph.driven_m, default=None)
+
+
+def _drawn(
+    graph: LaneGraph,
+    places: Sequence[Sequence[Spot]],
+    named: MapRoute,
+    rng: np.random.Generator,
+) -> Way | None:
+    """Return a way through places, and on to a drawn end where the end has no name; None where no
+    lanes lead through them.
+    """
+    if named.to is not None:
+        return _shortest(graph, places)
+    spot = places[0][int(rng.integers(len(places[0])))]
+    way = min(graph.through([[spot], *places[1:]]), key=graph.driven_m, default=None)
+    return None if way is None else graph.drawn(way, named.length_m or ROUTE_M, rng)
+
+
+def _longest(graph: LaneGraph, ways: Sequence[Way], length_m: float | None) -> Way:
+    """Return the longest of the drawn ways that are shorter than wanted.
+
+    Raises:
+        InputError: All are shorter than a route may be, or than the length that the user wants.
+    """
+    longest = max(ways, key=graph.driven_m, default=None)
+    longest_m = 0.0 if longest is None else graph.driven_m(longest)
+    least_m = length_m or SHORTEST_ROUTE_M
+    if longest is None or longest_m < least_m:
+        raise InputError(
+            f"no route of {least_m:.0f} m in {DRAWS} draws; the longest has {longest_m:.0f} m",
             "name map.route.from and map.route.to, or use a map with longer lanes",
         )
-    return best
+    return longest
 
 
 def _spots(text: str, graph: LaneGraph, street: StreetMap) -> list[Spot]:

@@ -103,16 +103,47 @@ class LaneGraph:
                 heapq.heappush(queue, step)
         return None
 
-    def drawn(self, start: Spot, length_m: float, rng: np.random.Generator) -> Way:
-        """Return a way from a place, at each fork into a lane drawn; it is shorter than
-        ``length_m`` where the lanes end.
+    def standing(self, spot: Spot) -> Way:
+        """Return the way without length at a spot."""
+        return Way((spot.lane_id,), spot.at_m, self.length_m[spot.lane_id] - spot.at_m)
+
+    def through(self, places: Sequence[Sequence[Spot]]) -> list[Way]:
+        """Return the shortest way to each spot of the last place that passes the others in order;
+        none to a spot that no such way leads to.
+
+        Args:
+            places: At least two, each with one spot for each of its lanes.
         """
-        chain = [start.lane_id]
-        driven_m = self.length_m[start.lane_id] - start.at_m
-        while driven_m < length_m and (after := self.following(chain[-1])):
+        ways = [self.standing(spot) for spot in places[0]]
+        begins = list(places[0])
+        for goals in places[1:]:
+            reached = []
+            for goal in goals:
+                longer = [
+                    _joined(way, further)
+                    for way, begin in zip(ways, begins, strict=True)
+                    if (further := self.between([begin], [goal])) is not None
+                ]
+                if longer:
+                    reached.append((min(longer, key=self.driven_m), goal))
+            ways = [way for way, _ in reached]
+            begins = [goal for _, goal in reached]
+        return ways
+
+    def drawn(self, way: Way, length_m: float, rng: np.random.Generator) -> Way:
+        """Return a way carried on from its end to a length, at each fork into a drawn lane that it
+        has not driven yet; it is shorter than ``length_m`` where there is none.
+        """
+        chain = list(way.lane_ids)
+        length_m = max(length_m, self.driven_m(way))
+        driven_m = self.driven_m(way) + way.beyond_m
+        while driven_m < length_m:
+            after = [key for key in self.following(chain[-1]) if key not in chain]
+            if not after:
+                break
             chain.append(after[int(rng.integers(len(after)))])
             driven_m += self.length_m[chain[-1]]
-        return Way(tuple(chain), start.at_m, max(driven_m - length_m, 0.0))
+        return Way(tuple(chain), way.start_m, max(driven_m - length_m, 0.0))
 
     def carried_on(self, way: Way, length_m: float) -> Way:
         """Return a way with the lanes after its end that turn least, for a length."""
@@ -170,6 +201,11 @@ class LaneGraph:
         steps = np.diff(self.lanes[lane_id].centre[:, :2], axis=0)
         first, last = (heading_of(step) for step in (steps[0], steps[-1]))
         return abs(float(wrap_angle(last - first)))
+
+
+def _joined(way: Way, further: Way) -> Way:
+    """Return a way and the one from its end as one."""
+    return Way((*way.lane_ids, *further.lane_ids[1:]), way.start_m, further.beyond_m)
 
 
 def _is_even(lane: Lane) -> bool:

@@ -218,7 +218,20 @@ class MapRoute(Part):
         alias="from",
         description="Start of the rear axle, ROAD:S: metres along the road (of Lanelet2: the lanelet).",
     )
+    via: tuple[Place, ...] = field("Places that the way passes in this order, ROAD:S.", ())
     to: Place | None = field("End, ROAD:S.", None)
+    length_m: float | None = Field(
+        default=None,
+        ge=20,
+        le=5000,
+        description="Length of a route whose end is drawn, metres; by default 200 where the lanes are as long.",
+    )
+
+    @model_validator(mode="after")
+    def _one_end(self) -> MapRoute:
+        if self.to is not None and self.length_m is not None:
+            raise ValueError("to and length_m | remove one: a length is of a route without an end")
+        return self
 
 
 class MapSpec(Part):

@@ -1,5 +1,6 @@
 """``simrun [run]``: drive scenarios behind renderers and tabulate the results."""
 
+import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -106,6 +107,16 @@ class Rollouts:
         str | None, Flag("Start of the route on a map, ROAD:S; by default drawn.", "--from")
     ] = None
     goal: Annotated[str | None, Flag("End of the route, ROAD:S.", "--to")] = None
+    via: Annotated[
+        tuple[str, ...],
+        Flag(
+            "Place that the route passes, ROAD:S. Repeatable, in driving order.", metavar="ROAD:S"
+        ),
+    ] = ()
+    route_length: Annotated[
+        float | None,
+        Flag("Length of a route whose end is drawn, metres; default: 200.", min=20, max=5000),
+    ] = None
     source: Annotated[
         str | None,
         Flag("Reader of the recorded log: a name, or package.module:Class.", names="source"),
@@ -116,8 +127,10 @@ class Rollouts:
         """Return the settings ``KEY=VALUE`` of the scenarios, the ends of the route among them, and
         those of the fixers.
         """
-        ends = {"from": self.start, "to": self.goal}
-        route = [f"map.route.{key}={place}" for key, place in ends.items() if place is not None]
+        ends = {"from": self.start, "to": self.goal, "length_m": self.route_length}
+        route = [f"map.route.{key}={value}" for key, value in ends.items() if value is not None]
+        if self.via:
+            route.append(f"map.route.via={json.dumps(list(self.via))}")
         return split_overrides((*self.overrides, *route))
 
     def scenes(self, scenarios: Sequence[str]) -> list[ScenarioRef]:
