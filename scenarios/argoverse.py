@@ -122,6 +122,17 @@ ARGOVERSE = Fields(
 )
 
 
+CALIBRATION = Fields(
+    "Argoverse 2 calibration",
+    read={
+        "intrinsics": "sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 height_px width_px",
+        "mounts": f"sensor_name {' '.join(POSE)}",
+    },
+    harmless={},
+    others="refused",
+)
+
+
 def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
     """Read ``log_map_archive_*.json`` into a lane map around ``origin (3,)``, with notes on what
     could not be kept.
@@ -444,8 +455,9 @@ def read_calibration(path: str | Path) -> tuple[CameraSpec, ...]:
     numbers: dict[str, Kind] = dict.fromkeys(
         ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"), "number"
     )
-    inner = files.read_feather(inner_path, {"sensor_name": "text", **numbers})
-    outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS})
+    inner = files.read_feather(inner_path, {"sensor_name": "text", **numbers}, "intrinsics")
+    outer = files.read_feather(outer_path, {"sensor_name": "text", **_NUMBERS}, "mounts")
+    CALIBRATION.check(files.met, folder, "use a calibration of the Argoverse 2 sensor set")
     mounts = dict(
         zip(
             outer["sensor_name"].astype(str),

@@ -17,12 +17,13 @@ from scipy.spatial.transform import Rotation
 from alpasim_plugin.cameras.lens import rays_of
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
-from scenarios.usdz_fields import met_in_sensor
+from scenarios.usdz_fields import USDZ, met_in_sensor
 
 FRONT_WIDE = "camera_front_wide_120fov"
 # Rendered size; the recorded frames are 1920 x 1080.
@@ -31,6 +32,12 @@ HEIGHT = 288
 HORIZONTAL_FOV_RAD = np.pi / 2
 
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
+LENS = Fields(
+    "f-theta lens",
+    read={"properties": USDZ.read["properties"]},
+    harmless={},
+    others="refused",
+)
 GIVE = "give an f-theta calibration"
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
@@ -71,6 +78,8 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
     for name, sensor in sensors.items():
         if not (sensor.get("properties") or {}).get("Model"):
             continue  # a radar or a lidar
+        met = met_in("properties", sensor["properties"])
+        LENS.check(met, f"{path}, {name}", "leave out what the lens does not need")
         with parsing(f"{path}, {name}", GIVE):
             cx, cy, width, height = _lens_numbers(sensor["properties"])[0]
             lens = sensor_lens(sensor["properties"])

@@ -10,6 +10,7 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, read_json_object
+from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
@@ -49,6 +50,7 @@ ROADSIDE_M = 15.0  # from the path, where objects stand on the ground
 CLEARLY_M = 0.5  # above the ground, or below it
 VIEW_PX = 320  # width of the views of a model without photographs
 TRAINED = "dataparser_transforms.json"  # of nerfstudio
+TRAINED_FRAME = Fields(TRAINED, read={"file": "transform scale"}, harmless={}, others="refused")
 SWAPPED = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))  # applied before it was stated
 VIEWS = 8  # that coverage is measured on
 OPAQUE_PIXEL = 0.5  # opacity from which the model covers a pixel
@@ -213,6 +215,7 @@ def _T_trained_source(path: Path, drive: SourceDrive) -> dict[str, F64]:
         applied[" with the axes of an old ns-process-data"] = SWAPPED
     with parsing(path, "copy it from the trained model again", "no transform and scale"):
         document = read_json_object(path)
+        TRAINED_FRAME.check(met_in("file", document), path, "copy it from the trained model again")
         scale = float(document["scale"]) / float(more.get("applied_scale", 1.0))
         trained = np.diag([scale, scale, scale, 1.0]) @ _rigid(document["transform"])
         return {

@@ -26,6 +26,7 @@ from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.drives.colmap import COLMAP
 from alpasim_plugin.drives.kitti import KITTI
 from alpasim_plugin.drives.py123d import PY123D
+from alpasim_plugin.drives.splat import TRAINED_FRAME
 from alpasim_plugin.gaussians.files.packed import COMPRESSED, SPZ
 from alpasim_plugin.gaussians.files.ply import PLY
 from alpasim_plugin.gaussians.files.sog import SOG
@@ -34,8 +35,9 @@ from alpasim_plugin.log.run_folder.records import RunInfo
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
 from evaluators.results import Summary
-from scenarios.argoverse import ARGOVERSE
+from scenarios.argoverse import ARGOVERSE, CALIBRATION
 from scenarios.commonroad_fields import COMMONROAD
+from scenarios.ftheta import LENS
 from scenarios.lanelet2 import LANELET2
 from scenarios.opendrive_fields import OPENDRIVE
 from scenarios.osi_messages import OSI
@@ -166,8 +168,8 @@ def key_tables() -> str:
 def field_table() -> str:
     """Return the table of the fields that readers know."""
     formats = (
-        *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, COLMAP, KITTI, PY123D, ARGOVERSE, USDZ),
-        *(OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC),
+        *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, TRAINED_FRAME, COLMAP, KITTI, PY123D),
+        *(ARGOVERSE, CALIBRATION, USDZ, LENS, OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC),
     )
     head = ("form", "read", "left out without a change", "refused")
     return table(head, [fields.row() for fields in formats])

@@ -382,6 +382,10 @@ def test_a_model_in_the_frame_of_its_trainer_is_moved_by_the_file_beside_it(tmp_
     moved, notes = _in_frame(tmp_path / "splat.ply", model, folder, drive)
     assert np.abs(moved.means - street_cloud().means).max() < 1e-6
     assert "dataparser_transforms.json" in str(notes)
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps({**document, "up": [0, 0, 1]}))
+    with pytest.raises(InputError, match="file/up"):
+        _in_frame(tmp_path / "splat.ply", model, folder, drive)
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(document))
     unmoved, _ = _in_frame(tmp_path / "splat.ply", street_cloud(), folder, drive)
     assert np.abs(unmoved.means - street_cloud().means).max() < 1e-9
 

@@ -15,6 +15,7 @@ from tests.scenarios.make_argoverse import (
     poses,
     vector_map,
     write_argoverse,
+    write_feather,
 )
 
 
@@ -135,6 +136,22 @@ def test_cuboids_that_are_no_tracks(tmp_path, name, value):
     rows[name][2] = value
     error = refused(write_argoverse(tmp_path / "x", annotations=rows))
     assert "annotations.feather" in error.message
+
+
+def test_a_coefficient_of_a_calibration_that_is_not_read_is_refused(tmp_path):
+    inner = {"sensor_name": ["front"]}
+    for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"):
+        inner[name] = [100.0]
+    outer = {"sensor_name": ["front"], "qw": [1.0]}
+    outer |= {name: [0.0] for name in ("qx", "qy", "qz", "tx_m", "ty_m", "tz_m")}
+    (tmp_path / "calibration").mkdir()
+    write_feather(tmp_path / "calibration/egovehicle_SE3_sensor.feather", outer)
+    write_feather(tmp_path / "calibration/intrinsics.feather", inner)
+    (camera,) = read_calibration(tmp_path)
+    assert camera.lens.coefficients == (100.0, 100.0, 0.0, 0.0, 100.0)
+    write_feather(tmp_path / "calibration/intrinsics.feather", inner | {"p1": [0.1]})
+    with pytest.raises(InputError, match="intrinsics/p1"):
+        read_calibration(tmp_path)
 
 
 def test_log_without_calibration(tmp_path):

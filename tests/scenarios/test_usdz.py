@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from scenarios import usdz_archive
+from scenarios.ftheta import rig_cameras
 from scenarios.load import load_scenario
 from scenarios.usdz import read_usdz, usdz_scene_id
 from tests.scenarios.make_usdz import (
@@ -220,6 +221,28 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path):
     assert_allclose(
         camera.T_rig_camera[:3, 2], [0.0, 1.0, 0.0], atol=1e-12
     )  # turned left by the correction: looks along y
+
+
+def test_a_property_of_a_lens_that_is_not_read_is_refused_where_the_lens_is_drawn(tmp_path):
+    properties = {"Model": "ftheta", "width": "3848", "height": "2168", "cx": "1924", "cy": "1084"}
+    properties |= {"polynomial": "0.0 0.00053 0 0 0", "polynomial-type": "pixeldistance-to-angle"}
+    nominal = {"roll-pitch-yaw": [0.0, 0.0, 0.0], "t": [1.7, 0.1, 1.4]}
+    for more, refused in (({}, False), ({"windshield": "0.1 0.2"}, True)):
+        sensor = {
+            "name": "camera:front:wide:120fov",
+            "properties": properties | more,
+            "nominalSensor2Rig_FLU": nominal,
+        }
+        row = {"calibration_estimate": {"rig_json": json.dumps({"rig": {"sensors": [sensor]}})}}
+        content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
+        path = write(tmp_path / "a.usdz", content)
+        assert ("properties/windshield (1)" in str(read_usdz(path).notes)) == refused
+        if refused:
+            with pytest.raises(InputError, match="properties/windshield"):
+                rig_cameras(path)
+        else:
+            (camera,) = rig_cameras(path)
+            assert camera.name == "camera_front_wide_120fov"
 
 
 def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path):
