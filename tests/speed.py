@@ -1,0 +1,157 @@
+"""What a frame costs here and at another commit, in pairs: ``python -m tests.speed BASE``.
+
+Processes of both commits take turns on one thread, by processor time, so that a busy machine slows
+both; a ratio is the median of those of the pairs. Numbers are printed and nothing is judged by them.
+The commit is checked out beside this one for the time of the measurement. Where it needs libraries
+of its own, ``--base-python`` names an interpreter that has them.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+REPO = Path(__file__).resolve().parents[1]
+RENDERERS = ("clean", "3dgs", "onefixer")
+Costs = Mapping[str, float]  # milliseconds of processor time by what was measured
+
+# Names that both commits have; what a frame costs is the least of equal drives, pass by pass.
+LOOP = """
+import json, sys, time
+from unittest.mock import patch
+import numba, torch
+from alpasim_plugin.lab.bench import loop
+numba.set_num_threads(1)
+torch.set_num_threads(1)
+scenario = loop.scene((512, 288), 3.0)
+costs = {}
+for renderer in sys.argv[1:]:
+    drives = []
+    for _ in range(3):
+        loop.clear_cache("recording:")
+        session = loop.make_renderer(renderer, scenario, threads=1)
+        clock = patch.object(time, "perf_counter", time.process_time)
+        with clock, loop.Recorder(scenario) as recorder:
+            policy = loop.make_policy(loop.POLICY, scenario)
+            loop.run_rollout(scenario, session, policy, recorder=recorder)
+            drives.append(recorder.facts()["stage_ms"])
+    frames = len(drives[0]["render"])
+    for stage in drives[0]:
+        passes = zip(*(drive[stage] for drive in drives))
+        costs[f"{renderer}: {stage}"] = sum(map(min, passes)) / frames
+print(json.dumps(costs))
+"""
+RASTER = """
+import json, time
+import numba, numpy as np
+from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera, rasterize
+numba.set_num_threads(1)
+costs = {}
+for count, width, height in ((100_000, 480, 272), (500_000, 960, 544)):
+    rng = np.random.default_rng(0)
+    z = rng.uniform(2, 60, count)
+    means = np.column_stack([rng.uniform(-1, 1, (count, 2)) * z[:, None] * [0.9, 0.5], z])
+    quats = rng.standard_normal((count, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    scales = np.exp(rng.normal(-3.2, 0.6, (count, 3)))
+    sh = 0.3 * rng.standard_normal((count, 4, 3))
+    cloud = GaussianCloud(means, quats, scales, rng.uniform(0.1, 0.95, count), sh)
+    K = np.array([[0.6 * width, 0, width / 2], [0, 0.6 * width, height / 2], [0, 0, 1.0]])
+    camera = PinholeCamera(width, height, K, np.eye(4))
+    rasterize(cloud, camera, backend="cpu")
+    spent = []
+    for _ in range(12):
+        began = time.process_time()
+        rasterize(cloud, camera, backend="cpu")
+        spent.append(time.process_time() - began)
+    costs[f"rasteriser: {count:,} splats at {width}x{height}"] = 1e3 * min(spent)
+print(json.dumps(costs))
+"""
+
+
+@contextmanager
+def checked_out(commit: str) -> Iterator[Path]:
+    """Check a commit out into a temporary folder for the time of the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "base"
+        git = ["git", "-C", str(REPO), "worktree"]
+        subprocess.run([*git, "add", "-q", "--detach", str(tree), commit], check=True)
+        try:
+            yield tree
+        finally:
+            subprocess.run([*git, "remove", "--force", str(tree)], check=True)
+
+
+def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> Costs:
+    """Measure a commit once, in processes of its own.
+
+    Raises:
+        subprocess.CalledProcessError: It cannot run what is measured.
+    """
+    threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    environment = os.environ | threads | {"PYTHONPATH": str(tree), "SIMRUN_CACHE": str(cache)}
+    costs: dict[str, float] = {}
+    for script, arguments in ((RASTER, ()), (LOOP, renderers)):
+        command = [python, "-c", script, *arguments]
+        done = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=cache
+        )
+        costs |= json.loads(done.stdout.splitlines()[-1])
+    return costs
+
+
+def table(pairs: Sequence[tuple[Costs, Costs]]) -> str:
+    """Return the medians over pairs of base and here as Markdown; what only one of them measures
+    is left out.
+
+    Example:
+        >>> print(table([({"log": 2.0}, {"log": 3.0}), ({"log": 4.0}, {"log": 5.0})]))
+        | | base, ms | here, ms | ratio, median | least | most |
+        |---|---:|---:|---:|---:|---:|
+        | log | 3.0 | 4.0 | 1.38 | 1.25 | 1.50 |
+    """
+    lines = [
+        "| | base, ms | here, ms | ratio, median | least | most |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    base, here = pairs[0]
+    for name in [name for name in here if name in base]:
+        ratios = [pair[1][name] / max(pair[0][name], 1e-9) for pair in pairs]
+        base_ms, here_ms = (statistics.median(pair[i][name] for pair in pairs) for i in (0, 1))
+        numbers = [f"{base_ms:.1f}", f"{here_ms:.1f}", f"{statistics.median(ratios):.2f}"]
+        lines.append(f"| {name} | {' | '.join(numbers)} | {min(ratios):.2f} | {max(ratios):.2f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("base", help="a commit")
+    parser.add_argument("--pairs", type=int, default=6)
+    parser.add_argument("--base-python", default=sys.executable)
+    parser.add_argument("--renderer", default=",".join(RENDERERS))
+    options = parser.parse_args()
+    renderers = options.renderer.split(",")
+    with checked_out(options.base) as base, tempfile.TemporaryDirectory() as folder:
+        caches = [Path(folder) / name for name in ("cache-base", "cache-here")]
+        sides = list(zip((base, REPO), (options.base_python, sys.executable), caches, strict=True))
+        for cache in caches:
+            cache.mkdir()
+        pairs = []
+        # The first pair compiles and fits, and is not counted.
+        for number in range(options.pairs + 1):
+            first, second = (costs_of(*side, renderers) for side in sides)
+            if number:
+                pairs.append((first, second))
+                print(f"pair {number} of {options.pairs}", file=sys.stderr)
+    print(table(pairs))
+
+
+if __name__ == "__main__":
+    main()

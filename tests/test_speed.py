@@ -1,0 +1,16 @@
+"""The bench in pairs: what it prints of what it has measured."""
+
+import doctest
+
+from tests import speed
+
+
+def test_the_table_is_of_medians_of_what_both_commits_measure():
+    assert doctest.testmod(speed).failed == 0
+    pairs = [({"a": 1.0, "old": 9.0}, {"a": 2.0, "new": 1.0})]
+    assert speed.table(pairs).splitlines()[2:] == ["| a | 1.0 | 2.0 | 2.00 | 2.00 | 2.00 |"]
+
+
+def test_both_scripts_are_python():
+    for script in (speed.LOOP, speed.RASTER):
+        compile(script, "a script", "exec")
