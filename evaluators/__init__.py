@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 from alpasim_plugin.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from evaluators.metrics import METRICS, MetricInfo
+    from evaluators.metrics import METRICS, MetricInfo, MetricValue
     from evaluators.metrics.collision import ContactEvent, contact_events
     from evaluators.metrics.presets import PRESETS, Preset, preset
     from evaluators.metrics.score import resolve_evaluators, score, series
     from evaluators.statistics.paired import paired
-    from evaluators.statistics.reduce import Reduction, RolloutValue, reduce_rollout, rollout_values
+    from evaluators.statistics.reduce import Reduction, reduce_rollout, rollout_values
     from evaluators.statistics.summary import aggregate, censoring
 
 __all__ = [
@@ -25,9 +25,9 @@ __all__ = [
     "PRESETS",
     "ContactEvent",
     "MetricInfo",
+    "MetricValue",
     "Preset",
     "Reduction",
-    "RolloutValue",
     "aggregate",
     "censoring",
     "contact_events",
@@ -41,12 +41,12 @@ __all__ = [
 ]
 
 _HOMES = {
-    ".metrics": ("METRICS", "MetricInfo"),
+    ".metrics": ("METRICS", "MetricInfo", "MetricValue"),
     ".metrics.collision": ("ContactEvent", "contact_events"),
     ".metrics.presets": ("PRESETS", "Preset", "preset"),
     ".metrics.score": ("resolve_evaluators", "score", "series"),
     ".statistics.paired": ("paired",),
-    ".statistics.reduce": ("Reduction", "RolloutValue", "reduce_rollout", "rollout_values"),
+    ".statistics.reduce": ("Reduction", "reduce_rollout", "rollout_values"),
     ".statistics.summary": ("aggregate", "censoring"),
 }
 __getattr__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

@@ -16,7 +16,7 @@ from alpasim_plugin.core.files import parse_json, read_bytes, read_record
 from alpasim_plugin.core.files.limits import JSON_BYTES
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import Direction
-from alpasim_plugin.log.run_folder.records import Pool, Repeat
+from alpasim_plugin.log.run_folder.records import Pool, Repeat, RolloutError
 
 SCHEMA = 2  # of summary.json
 
@@ -351,21 +351,6 @@ class Censoring:
     bounds_rollouts: dict[str, Bounds]
     bounds_rollouts_ci95: dict[str, tuple[float | None, float | None]]
     cut: dict[str, int]
-
-
-@dataclass(frozen=True)
-class RolloutError:
-    """Why a rollout could not be run or scored.
-
-    Attributes:
-        message: What is wrong with which value.
-        hint: What to do.
-        failure_class: Whose fault it is (docs/cli.md).
-    """
-
-    message: str
-    hint: str
-    failure_class: str
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import json
 
 from alpasim_plugin.core.files import read_record
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 
 CONFIG = {
     "preset": "paper",
@@ -51,3 +51,28 @@ def run_info(members):
     }
     content = {**members, "config": config, **parts}
     return read_record(RunInfo, json.dumps(content).encode(), "run.json")
+
+
+def manifest(members):
+    """Make ``manifest.json`` of its members as JSON has them; metrics may be stated without unit and
+    direction, an error in part, and the key is that of one rollout.
+    """
+    usual = {
+        "renderer": "clean",
+        "policy": "p",
+        "scene": "s",
+        "seed": 0,
+        "path": "rollouts/clean/p/s/0",
+        "status": "ok",
+        "wall_s": 1.0,
+    }
+    content = {**usual, **members}
+    content["metrics"] = {
+        name: {"unit": "", "direction": "lower", **entry}
+        for name, entry in members.get("metrics", {}).items()
+    }
+    if members.get("error") is not None:
+        content["error"] = {"message": "", "hint": "", "failure_class": "", **members["error"]}
+    events = members.get("events", ())
+    content["events"] = [{"t_us": 0, "t_s": 0.0, "x_m": 0.0, "y_m": 0.0, **one} for one in events]
+    return read_record(Manifest, json.dumps(content).encode(), "manifest.json")

@@ -148,10 +148,10 @@ def check_renderer(
 
 def _outcomes(log: RolloutLog, scene: Scene) -> tuple[str, ...]:
     """Return the outcomes of a logged rollout, by the paper's preset."""
-    values = reduce_rollout(score(log, scene, preset="paper"), "paper").as_dict()
+    values = reduce_rollout(score(log, scene, preset="paper"), "paper").values
     measured = {name: values[name] for name in OUTCOMES if name in values}
     return tuple(
-        name for name, entry in measured.items() if entry["valid"] and entry["value"] >= 0.5
+        name for name, entry in measured.items() if entry.value is not None and entry.value >= 0.5
     )
 
 

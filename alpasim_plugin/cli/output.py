@@ -15,9 +15,10 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.files.stage import stages_in
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.printing import say, say_document
 from alpasim_plugin.core.printing import warn as warn
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
 from evaluators.statistics.numbers import plural
 
@@ -135,14 +136,14 @@ class Progress(progress.Progress):
                     self.printed_s = now_s
                     self.say(text)
 
-    def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
+    def rollout_done(self, manifest: Manifest, reused: bool) -> None:
         """Count a rollout and print its result; on a terminal only failures."""
         task = self.tasks[-1]
         self.advance(task.id)
         done = int(task.completed)
         total = int(task.total or 0)
         is_shown = done == total or done % max(1, total // MAX_LINES) == 0
-        if manifest["status"] != "ok" or (self.disable and is_shown):
+        if not manifest.ok or (self.disable and is_shown):
             self.say(f"[{done}/{total}] {describe(manifest, reused)}")
 
     def looked(self, state: State, rollouts: int, ceiling: int) -> None:
@@ -280,18 +281,18 @@ def policy_notes(plan: RunPlan) -> list[str]:
     return lines
 
 
-def describe(manifest: JsonObject, reused: bool) -> str:
+def describe(manifest: Manifest, reused: bool) -> str:
     """Return one line with a rollout's result."""
-    names = [manifest["renderer"], manifest["policy"], manifest["scene"]]
-    cell = f"{' '.join(names)} seed {manifest['seed']}"
-    if "rollout" in manifest:  # of a log that is scored
-        cell = f"{manifest['rollout']}: {cell}"
-    if manifest["status"] != "ok":
-        return f"{cell}: FAILED ({manifest['error']['failure_class']})"
+    names = [manifest.renderer, manifest.policy, manifest.scene]
+    cell = f"{' '.join(names)} seed {manifest.seed}"
+    if manifest.rollout is not None:  # of a log that is scored
+        cell = f"{manifest.rollout}: {cell}"
+    if not manifest.ok:
+        return f"{cell}: FAILED ({manifest.failure_class})"
     from evaluators.metrics.outcomes import NO_OUTCOME, event_words  # a listing needs no metrics
 
-    events = dict.fromkeys(event_words(event["metric"]) for event in manifest.get("events", []))
-    cost = " (reused)" if reused else f", {manifest['wall_s']:.1f} s"
-    if "copied_from" in manifest and not reused:
-        cost = f" (copied from {manifest['copied_from']})"
+    events = dict.fromkeys(event_words(event.metric) for event in manifest.events)
+    cost = " (reused)" if reused else f", {manifest.wall_s:.1f} s"
+    if manifest.copied_from is not None and not reused:
+        cost = f" (copied from {manifest.copied_from})"
     return f"{cell}: {', '.join(events) or NO_OUTCOME}{cost}"

@@ -314,8 +314,8 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             info |= {
                 "ended": ended,
                 "metrics": {
-                    name: entry["value"] if entry["valid"] else None
-                    for name, entry in scored["metrics"].items()
+                    name: entry.value if entry.valid else None
+                    for name, entry in scored.metrics.items()
                 },
             }
             cameras = {} if self._camera is None else {self._camera.name: self._camera}

@@ -30,7 +30,7 @@ from alpasim_plugin.core.files.atomic import disk_error
 from alpasim_plugin.core.files.inputs import ABSENT, Inputs
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, build, complete
 from alpasim_plugin.core.parts.blame import last_called
 from alpasim_plugin.core.parts.patches import replaced_code
@@ -43,17 +43,16 @@ from alpasim_plugin.log.run_folder.manifests import (
     inspect_rollout,
     write_manifest,
 )
+from alpasim_plugin.log.run_folder.records import Manifest, RolloutError
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
     DERIVED,
     DRIVEN,
     FRAMES_NAME,
-    INPUTS,
     LOG_NAME,
     MANIFEST,
     OUTPUT_NAME,
     SAME_POSES,
-    SCORE_INPUTS,
     VIDEO_NAME,
     WHY_NAME,
 )
@@ -131,7 +130,7 @@ def run_cell(
     threads: int,
     builder: PartsBuilder = build_parts,
     load: Callable[[ScenarioRef], Scenario] | None = None,
-) -> JsonObject:
+) -> Manifest:
     """Run and score one cell and return its manifest. The manifest is written last: a folder
     without one is unfinished.
 
@@ -147,7 +146,7 @@ def run_cell(
         load: Gives the scenario; None reads it from its file.
     """
     folder = root / cell.folder
-    with _writing_manifest(cell, options, folder) as manifest:
+    with _writing_manifest(cell, options, folder) as draft:
         planned = _scenario(cell) if load is None else load(cell.ref)
         scenario = replace(planned, stop_at_path_end=cell.stops_at_path_end)
         with parts_print_to_stderr(folder / OUTPUT_NAME), _same_folder(), Inputs() as inputs:
@@ -155,15 +154,16 @@ def run_cell(
             announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
         require_same_code()
-        manifest[INPUTS] = _not_planned(inputs, _parts_of_drive(cell), scenario, root)
-        manifest |= recorder.facts() | _facts_of(parts, has_fixer=cell.renderer.fixer is not None)
-        manifest |= _score(root, cell, options, scenario)
+        read = _not_planned(inputs, _parts_of_drive(cell), scenario, root)
+        draft.add(inputs=read, **recorder.facts())
+        draft.add(**_facts_of(parts, has_fixer=cell.renderer.fixer is not None))
+        draft.manifest = _scored(draft.manifest, root, cell, options, scenario)
         require_same_code()
-        if _wants_film(options.video, manifest):
+        if _wants_film(options.video, draft.manifest):
             recorder.film.save(folder)
-            if not manifest["has_camera"]:
+            if not draft.manifest.has_camera:
                 _render_film(cell, options, scenario, folder, threads)
-    return manifest
+    return draft.manifest
 
 
 def _parts_of_drive(cell: Cell) -> list[PartSpec]:
@@ -194,16 +194,16 @@ def _not_planned(
     }
 
 
-def is_copied(manifest: JsonView) -> bool:
+def is_copied(manifest: Manifest) -> bool:
     """Tell whether the same rollout behind other renderers is a copy of this one, which their
     images could not have changed.
     """
-    return manifest["status"] == "ok" and not manifest["has_camera"]
+    return manifest.ok and not manifest.has_camera
 
 
 def copy_cell(
-    cell: Cell, options: RunOptions, root: Path, threads: int, original: JsonObject
-) -> JsonObject:
+    cell: Cell, options: RunOptions, root: Path, threads: int, original: Manifest
+) -> Manifest:
     """Copy the rollout of a policy without a camera into the cell of another renderer and return
     the manifest. It is neither driven nor scored again; its film is rendered.
 
@@ -217,8 +217,8 @@ def copy_cell(
         original: Manifest of the rollout that was driven; see `is_copied`.
     """
     folder = root / cell.folder
-    source = root / original["path"]
-    with _writing_manifest(cell, options, folder) as manifest:
+    source = root / original.path
+    with _writing_manifest(cell, options, folder) as draft:
         session = session_uuid(cell.seed, cell.rollout_key)
         name = _service_name(cell.renderer)
         copy_log(source / LOG_NAME, folder / LOG_NAME, session, name)
@@ -226,42 +226,59 @@ def copy_cell(
             if os.path.exists(source / file):
                 shutil.copyfile(source / file, folder / file)
         copy_steps(source, folder, cell.renderer.name)
-        manifest |= original | manifest
-        manifest |= {"copied_from": original["path"], "session_uuid": session, "stage_ms": {}}
-        if _wants_film(options.video, manifest):
+        draft.manifest = replace(
+            original,
+            **_begun_members(cell),
+            preset=options.preset,
+            stops_at_path_end=cell.stops_at_path_end,
+            video=options.video,
+            copied_from=original.path,
+            session_uuid=session,
+            stage_ms={},
+            reused=None,
+        )
+        if _wants_film(options.video, draft.manifest):
             with parts_print_to_stderr(folder / OUTPUT_NAME):
                 _render_film(cell, options, _scenario(cell), folder, threads)
-    return manifest
+    return draft.manifest
+
+
+@dataclass
+class _Draft:
+    """The manifest of a rollout while it is made."""
+
+    manifest: Manifest
+
+    def add(self, **members: Any) -> None:
+        """Set members."""
+        self.manifest = replace(self.manifest, **members)
 
 
 @contextmanager
-def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator[JsonObject]:
-    """Clear the folder of a rollout, yield its manifest, and write it after the block; what the
-    block raises becomes the rollout's failure.
+def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator[_Draft]:
+    """Clear the folder of a rollout, yield the draft of its manifest, and write it after the block;
+    what the block raises becomes the rollout's failure.
     """
     began = time.perf_counter()
     # OpenCV's pool is outside the thread budget, and frames are too small to gain from it.
     cv2.setNumThreads(1)
-    manifest = _begun(cell) | {
-        "preset": options.preset,
-        "stops_at_path_end": cell.stops_at_path_end,
-        "video": options.video,
-    }
+    draft = _Draft(_begun(cell))
+    draft.add(preset=options.preset, stops_at_path_end=cell.stops_at_path_end, video=options.video)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # The manifest first: without it nothing is trusted.
         for name in (MANIFEST, *DRIVEN, *DERIVED, SAME_POSES, WHY_NAME):
             (folder / name).unlink(missing_ok=True)
-        yield manifest
-        manifest["status"] = "ok"
+        yield draft
+        draft.add(status="ok")
     except BaseException as error:
         if is_interruption(error):
             raise
-        manifest.pop("metrics", None)  # a film that failed leaves a rollout without values
-        manifest |= _failure(error, folder)
+        # A film that failed leaves a rollout without values.
+        draft.add(status="failed", metrics={}, **_failure(error, folder))
         _log_traceback(error, folder)
-    manifest["wall_s"] = round(time.perf_counter() - began, 4)
-    write_manifest(folder, manifest)
+    draft.add(wall_s=round(time.perf_counter() - began, 4))
+    write_manifest(folder, draft.manifest)
 
 
 @contextmanager
@@ -274,8 +291,8 @@ def _same_folder() -> Iterator[None]:
         os.chdir(folder)
 
 
-def _wants_film(video: str, manifest: JsonView) -> bool:
-    return video == "all" or (video == "failures" and bool(manifest["events"]))
+def _wants_film(video: str, manifest: Manifest) -> bool:
+    return video == "all" or (video == "failures" and bool(manifest.events))
 
 
 def _render_film(
@@ -285,8 +302,13 @@ def _render_film(
     write_film(folder, scenario, renderer)
 
 
-def _begun(cell: Cell) -> JsonObject:
-    """Return what the manifest of a rollout begins with."""
+def _begun(cell: Cell) -> Manifest:
+    """Return what the manifest of a rollout begins with: until it ends, it has failed."""
+    return Manifest(**_begun_members(cell), status="failed", wall_s=None)
+
+
+def _begun_members(cell: Cell) -> JsonObject:
+    """Return the members of a manifest that the plan decides."""
     return {
         **cell.names,
         "path": cell.folder.as_posix(),
@@ -353,7 +375,7 @@ def require_same_code() -> None:
 
 def _failure(error: BaseException, folder: Path) -> JsonObject:
     """Return what the manifest says of a rollout that failed; called where the error is handled."""
-    facts: JsonObject = {"status": "failed", "traceback": traceback.format_exc()}
+    facts: JsonObject = {"traceback": traceback.format_exc()}
     culprit = last_called()
     if isinstance(error, OSError) and error.errno == errno.EBADF and culprit is not None:
         error = culprit.error("it closed files of its process")
@@ -366,14 +388,19 @@ def _failure(error: BaseException, folder: Path) -> JsonObject:
             error = fault
     if isinstance(error, SimrunError):
         facts["final"] = isinstance(error, FaultOfPart) and error.is_final
-        return facts | {"error": error.as_dict()}
+        return facts | {"error": error_of(error)}
     return facts | {
-        "error": {
-            "message": f"{type(error).__name__}: {error}",
-            "hint": "Read the traceback in the manifest and report it.",
-            "failure_class": "infrastructure",
-        }
+        "error": RolloutError(
+            message=f"{type(error).__name__}: {error}",
+            hint="Read the traceback in the manifest and report it.",
+            failure_class="infrastructure",
+        )
     }
+
+
+def error_of(error: SimrunError) -> RolloutError:
+    """Return what a manifest says of an error."""
+    return RolloutError(**error.as_dict())
 
 
 def _log_traceback(error: BaseException, folder: Path) -> None:
@@ -404,17 +431,17 @@ def users_parts(cell: Cell) -> str:
     return ", ".join(names)
 
 
-def failed_manifest(cell: Cell, error: SimrunError) -> JsonObject:
+def failed_manifest(cell: Cell, error: SimrunError) -> Manifest:
     """Return the manifest of a rollout that was never driven to its end."""
-    return _begun(cell) | {"status": "failed", "error": error.as_dict(), "wall_s": None}
+    return replace(_begun(cell), error=error_of(error))
 
 
-def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: JsonObject) -> JsonObject:
+def rescore_cell(cell: Cell, options: RunOptions, root: Path, manifest: Manifest) -> Manifest:
     """Score a finished rollout again from its log: another preset, changed evaluators or a file that
     one of them read, or a damaged table; return the new manifest.
     """
-    manifest = manifest | _score(root, cell, options, _scenario(cell))
-    manifest |= {"score_key": cell.score_key, "preset": options.preset}
+    manifest = _scored(manifest, root, cell, options, _scenario(cell))
+    manifest = replace(manifest, score_key=cell.score_key, preset=options.preset)
     write_manifest(root / cell.folder, manifest)
     return manifest
 
@@ -435,22 +462,21 @@ def find_rollout_state(
     """
     state = inspect_rollout(root, cell.folder.as_posix())
     manifest = state.manifest
-    if manifest is None or manifest.get("rollout_key") != cell.rollout_key:
+    if manifest is None or manifest.rollout_key != cell.rollout_key:
         return "drive", state
-    has_failed = manifest["status"] != "ok"
-    if has_failed and (cell.undigested or not manifest.get("final")):
+    if not manifest.ok and (cell.undigested or not manifest.final):
         return "drive", state
-    if changed_inputs(manifest):
+    if changed_inputs(manifest.inputs):
         return "drive", state
     if cell.undigested and not reuse_undigested:
         return "drive", state
-    if manifest["status"] != "ok":
+    if not manifest.ok:
         return "none", state
     # Presets that stop at the end of the path and those that drive on differ in these alone.
-    stops_alike = manifest.get("stops_at_path_end") == cell.stops_at_path_end
-    if manifest.get("passed_path_end") and not stops_alike:
+    stops_alike = manifest.stops_at_path_end == cell.stops_at_path_end
+    if manifest.passed_path_end and not stops_alike:
         return "drive", state
-    is_filmed = VIDEO_NAME in manifest["files"] or manifest.get("video") == video
+    is_filmed = VIDEO_NAME in manifest.files or manifest.video == video
     if _wants_film(video, manifest) and not is_filmed:
         return "drive", state
     if state.action == "none" and not _is_scored_so(cell, manifest, reuse_undigested):
@@ -458,33 +484,36 @@ def find_rollout_state(
     return state.action, state
 
 
-def _is_scored_so(cell: Cell, manifest: JsonView, reuse_undigested: bool) -> bool:
+def _is_scored_so(cell: Cell, manifest: Manifest, reuse_undigested: bool) -> bool:
     """Tell whether the scores of a rollout are those that its cell asks for."""
-    if manifest.get("score_key") != cell.score_key or changed_inputs(manifest, SCORE_INPUTS):
+    if manifest.score_key != cell.score_key or changed_inputs(manifest.score_inputs):
         return False
     return reuse_undigested or all(part.digest is not None for part in cell.evaluators)
 
 
-def kept_failure(cell: Cell, manifest: JsonView) -> str:
+def kept_failure(cell: Cell, manifest: Manifest) -> str:
     """Say that a failure is kept, and what would drive the rollout again."""
     parts = [cell.policy, cell.renderer.base, cell.renderer.fixer]
     files = [path for part in parts if part is not None for path in (*part.code, *part.files)]
     edit = f"an edit of {some_of(files, 3)}" if files else "another version of simrun"
     return (
         f"{cell.folder.as_posix()}: failed before with this code and these files, not driven again; "
-        f"{edit} drives it again, and so does removing {manifest['path']}"
+        f"{edit} drives it again, and so does removing {manifest.path}"
     )
 
 
-def _score(root: Path, cell: Cell, options: RunOptions, scenario: Scenario) -> JsonObject:
-    """Score a log, write its steps, and return what the manifest says of its scores."""
+def _scored(
+    manifest: Manifest, root: Path, cell: Cell, options: RunOptions, scenario: Scenario
+) -> Manifest:
+    """Score a log, write its steps, and return the manifest with its scores."""
     folder = root / cell.folder
     with Inputs() as inputs:
-        rows, facts = score_log(
+        rows, scores = score_log(
             folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
         )
     write_steps(folder, [cell.names | row for row in rows])
-    return facts | {SCORE_INPUTS: _not_planned(inputs, cell.evaluators, scenario, root)}
+    read = _not_planned(inputs, cell.evaluators, scenario, root)
+    return replace(scores.stated_in(manifest), score_inputs=read)
 
 
 @contextmanager

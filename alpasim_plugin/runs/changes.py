@@ -6,30 +6,26 @@ from collections.abc import Mapping, Sequence
 
 from alpasim_plugin.core.files import content_of, some_of
 from alpasim_plugin.core.files.inputs import ABSENT
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import PartSpec
-from alpasim_plugin.log.run_folder.records import PartFacts, RunInfo
-from alpasim_plugin.log.run_folder.schema import INPUTS, SCORE_INPUTS
+from alpasim_plugin.log.run_folder.records import Manifest, PartFacts, RunInfo
 from alpasim_plugin.runs.plan import SIMRUN, Cell, RunPlan
 
 OLDER = "it was driven by another version of simrun"
 SHOWN_FILES = 3
 
 
-def changed_inputs(manifest: JsonView, member: str = INPUTS) -> dict[str, str]:
+def changed_inputs(before: Mapping[str, str]) -> dict[str, str]:
     """Return the files that a rollout, or its scoring, read beside what its key holds and that are
     others now: the content at present by path.
 
     Args:
-        manifest: Of the rollout.
-        member: `INPUTS` or `SCORE_INPUTS`.
+        before: The content that was read, by path.
     """
-    before: Mapping[str, str] = manifest.get(member) or {}
     now = {path: content_of(path) for path in before}
     return {path: content for path, content in now.items() if content != before[path]}
 
 
-def reasons(cell: Cell, manifest: JsonView, held: RunInfo | None, plan: RunPlan) -> list[str]:
+def reasons(cell: Cell, manifest: Manifest, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Say why a rollout is driven again that another command, or an earlier one, drove; nothing where
     all that it was made of is as it was.
 
@@ -39,8 +35,8 @@ def reasons(cell: Cell, manifest: JsonView, held: RunInfo | None, plan: RunPlan)
         held: ``run.json`` of that time; None where it is not known.
         plan: The run.
     """
-    changed = _file_changes(manifest.get(INPUTS) or {}, changed_inputs(manifest))
-    before: Mapping[str, str | None] | None = manifest.get("made_of")
+    changed = _file_changes(manifest.inputs, changed_inputs(manifest.inputs))
+    before = manifest.made_of
     if before is None:
         return [OLDER]
     now = cell.made_of
@@ -54,13 +50,11 @@ def reasons(cell: Cell, manifest: JsonView, held: RunInfo | None, plan: RunPlan)
     return changed
 
 
-def score_reasons(manifest: JsonView, held: RunInfo | None, plan: RunPlan) -> list[str]:
+def score_reasons(manifest: Manifest, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Say why a rollout is scored again whose files are whole: the arguments are those of `reasons`."""
-    changed = _file_changes(
-        manifest.get(SCORE_INPUTS) or {}, changed_inputs(manifest, SCORE_INPUTS)
-    )
-    if manifest.get("preset") != plan.options.preset:
-        changed.append(f"the preset was {manifest.get('preset')}")
+    changed = _file_changes(manifest.score_inputs, changed_inputs(manifest.score_inputs))
+    if manifest.preset != plan.options.preset:
+        changed.append(f"the preset was {manifest.preset}")
     stated = {} if held is None else held.parts
     evaluators = [part for part in plan.parts if part.kind == "evaluator"]
     return changed + changed_evaluators(stated, evaluators)

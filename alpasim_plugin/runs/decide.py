@@ -14,10 +14,9 @@ import numpy as np
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.atomic import write_json
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.log.run_folder.writer import rollout_table
@@ -115,7 +114,7 @@ class SequentialTest:
     question: Question
     scenes_per_look: int = SCENES_PER_LOOK
     n_scenes: int = 0  # that were driven, the first of the order
-    driven: dict[str, JsonObject] = field(default_factory=dict)
+    driven: dict[str, Manifest] = field(default_factory=dict)
     looks: list[Any] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)  # binding metrics of which a pair has no value
     state: State = field(default_factory=lambda: State(0, "open", {}))
@@ -147,7 +146,7 @@ class SequentialTest:
         cells = [cell for scene in batch for cell in self.plan.cells if cell.scene == scene]
         return part_of(self.plan, cells)
 
-    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
+    def add(self, plan: RunPlan, manifests: Sequence[Manifest]) -> None:
         """Take in a batch and analyse all scenes so far."""
         folders = [cell.folder.as_posix() for cell in plan.cells]
         self.driven |= dict(zip(folders, manifests, strict=True))

@@ -8,7 +8,7 @@ therefore run rollouts in any order.
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -17,9 +17,8 @@ from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.devices import share_card
 from alpasim_plugin.core.errors import PolicyError, SimrunError
 from alpasim_plugin.core.files.stage import shown_in
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.manifests import write_manifest
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.log.run_folder.schema import STAGES
 from alpasim_plugin.runs.cell import (
     copy_cell,
@@ -38,9 +37,9 @@ from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan
 
 NOT_DRIVEN = "Correct the policy; it was not driven."
 
-OnDone = Callable[[JsonObject, bool], None]  # (manifest, reused)
-Job = tuple[Cell, JsonObject | None]  # with the manifest of the rollout that it is a copy of
-Done = Iterator[tuple[Cell, JsonObject]]
+OnDone = Callable[[Manifest, bool], None]  # (manifest, reused)
+Job = tuple[Cell, Manifest | None]  # with the manifest of the rollout that it is a copy of
+Done = Iterator[tuple[Cell, Manifest]]
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def execute(
     notify: Callable[[str], None],
     held: RunInfo | None = None,
     hanging: Mapping[str, str] = MappingProxyType({}),
-) -> list[JsonObject]:
+) -> list[Manifest]:
     """Run every unfinished rollout and return all manifests in the plan's order.
 
     Whole rollouts are reused; those scored with another preset, or whose table is damaged, are
@@ -136,7 +135,7 @@ def execute(
 
     def take(done: Done) -> None:
         for cell, manifest in done:
-            work.manifests[cell.folder] = manifest
+            work.manifests[cell.folder] = replace(manifest, reused=False)
             on_done(manifest, False)
 
     try:
@@ -163,7 +162,7 @@ class _Work:
         score_causes: Why those are.
     """
 
-    manifests: dict[Path, JsonObject] = field(default_factory=dict)
+    manifests: dict[Path, Manifest] = field(default_factory=dict)
     todo: list[Cell] = field(default_factory=list)
     copies: list[tuple[Cell, Cell]] = field(default_factory=list)
     n_again: int = 0
@@ -196,8 +195,8 @@ def _sort_cells(
         # None where it is still to be driven
         driven = work.manifests.get(original.folder)
         if original is not cell and (driven is None or is_copied(driven)):
-            copied_from = state.manifest and state.manifest.get("copied_from")
-            if driven is None or action != "none" or copied_from != driven["path"]:
+            copied_from = state.manifest and state.manifest.copied_from
+            if driven is None or action != "none" or copied_from != driven.path:
                 work.copies.append((cell, original))
                 continue
         manifest = state.manifest
@@ -212,21 +211,19 @@ def _sort_cells(
             work.n_again += bool(why)
             work.causes += why
             continue
-        if manifest["status"] != "ok":
+        if not manifest.ok:
             notify(kept_failure(cell, manifest))
         if action == "score":
             if not state.damage:
                 work.n_scored += 1
                 work.score_causes += score_reasons(manifest, held, plan)
             manifest = _rescored(cell, plan, root, manifest, how)
-        work.manifests[cell.folder] = manifest
+        work.manifests[cell.folder] = replace(manifest, reused=True)
         on_done(manifest, True)
     return work
 
 
-def _rescored(
-    cell: Cell, plan: RunPlan, root: Path, manifest: JsonObject, how: HowToRun
-) -> JsonObject:
+def _rescored(cell: Cell, plan: RunPlan, root: Path, manifest: Manifest, how: HowToRun) -> Manifest:
     """Score a rollout again; where an evaluator fails, its log and its values stay on disk."""
     parts = ", ".join(part.name for part in cell.evaluators if part.is_users)
     work = partial(rescore_cell, options=plan.options, root=root.absolute(), manifest=manifest)
@@ -256,7 +253,7 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
         jobs = sorted(jobs, key=lambda job: job[0].renderer.fixer is None)
     work = partial(_work, plan.options, root.absolute(), how.local_threads)
 
-    def written(job: Job) -> JsonObject | None:
+    def written(job: Job) -> Manifest | None:
         """Return the manifest of a rollout whose worker died after it had written it."""
         action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
@@ -270,7 +267,7 @@ def _users_parts(job: Job) -> str:
     return users_parts(job[0])
 
 
-def _work(options: RunOptions, root: Path, local_threads: Threads, job: Job) -> JsonObject:
+def _work(options: RunOptions, root: Path, local_threads: Threads, job: Job) -> Manifest:
     """Drive or copy a rollout in a worker of this machine."""
     share_card(options.device, local_threads.workers)
     cell, original = job
@@ -281,14 +278,14 @@ def _work(options: RunOptions, root: Path, local_threads: Threads, job: Job) -> 
         return copy_cell(cell, options, root, threads, original)
 
 
-def _lost(cell: Cell, root: Path, lost: Lost) -> JsonObject:
+def _lost(cell: Cell, root: Path, lost: Lost) -> Manifest:
     """Write the manifest of a rollout whose workers died, or that was ended since it took too
     long.
     """
     return _write_failed(cell, root, lost.error(cell.folder.as_posix()))
 
 
-def _write_failed(cell: Cell, root: Path, error: SimrunError) -> JsonObject:
+def _write_failed(cell: Cell, root: Path, error: SimrunError) -> Manifest:
     manifest = failed_manifest(cell, error)
     write_manifest(root / cell.folder, manifest)
     return manifest

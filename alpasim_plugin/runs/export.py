@@ -27,7 +27,6 @@ from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, write_j
 from alpasim_plugin.core.files.config import load_yaml
 from alpasim_plugin.core.files.limits import ARCHIVE_BYTES
 from alpasim_plugin.core.files.reading import open_regular
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import require_installed
 from alpasim_plugin.core.types import (
     Scenario,
@@ -36,7 +35,7 @@ from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.asl import copy_log
 from alpasim_plugin.log.run_folder.check import cells_of_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, slug
 from alpasim_plugin.runs.plan import ref_of
 from alpasim_plugin.runs.score_logs import check_vouched
@@ -232,27 +231,27 @@ def export_run(root: Path, out: Path, say: Callable[[str], None]) -> Export:
     runs: dict[tuple[str, str], ExportedRun] = {}
     with atomic_folder(out) as partial:
         for manifest in manifests:
-            key = (str(manifest["renderer"]), str(manifest["policy"]))
+            key = (manifest.renderer, manifest.policy)
             run = runs.setdefault(key, ExportedRun(*key, f"{slug(key[0])}/{slug(key[1])}"))
-            if manifest["status"] != "ok":
+            if not manifest.ok:
                 run.failed += 1
                 continue
-            source = root / manifest["path"] / LOG_NAME
+            source = root / manifest.path / LOG_NAME
             check_vouched(source)
             rollout = read_asl(source)
-            cameras = alpasim_cameras(loaded[manifest["scene"]][1].cameras)
+            cameras = alpasim_cameras(loaded[manifest.scene][1].cameras)
             names = {camera.name: name for name, camera in cameras.items() if name != camera.name}
             if not rollout.images:
                 raise InputError(
-                    f"{manifest['path']}: the log holds no camera image, and AlpaSim's evaluation needs them",
-                    f"run again without {manifest['policy']}: it uses no camera",
+                    f"{manifest.path}: the log holds no camera image, and AlpaSim's evaluation needs them",
+                    f"run again without {manifest.policy}: it uses no camera",
                 )
-            target = partial / run.folder / "rollouts" / manifest["scene"] / rollout.session_uuid
+            target = partial / run.folder / "rollouts" / manifest.scene / rollout.session_uuid
             target.mkdir(parents=True)
             copy_log(source, target / LOG_NAME, cameras=names)
             (target / COMPLETE).touch()
             run.rollouts += 1
-            say(f"{run.folder}/{manifest['scene']}/{manifest['seed']}")
+            say(f"{run.folder}/{manifest.scene}/{manifest.seed}")
         for run in runs.values():
             _finish(partial / run.folder, out, run, info, manifests)
         scenes = _write_scenes(partial, loaded)
@@ -264,7 +263,7 @@ def _finish(
     out: Path,
     run: ExportedRun,
     info: RunInfo,
-    manifests: Sequence[JsonView],
+    manifests: Sequence[Manifest],
 ) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     name = f"{run.renderer} {run.policy}"
@@ -288,17 +287,15 @@ def _finish(
     ):
         write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
     failed = [
-        m
-        for m in manifests
-        if m["status"] != "ok" and (m["renderer"], m["policy"]) == (run.renderer, run.policy)
+        m for m in manifests if not m.ok and (m.renderer, m.policy) == (run.renderer, run.policy)
     ]
     if failed:
         rows = [
             {
                 "run_name": name,
-                "clipgt_id": m["scene"],
-                "rollout_id": f"seed-{m['seed']}",
-                "error": m["error"]["message"],
+                "clipgt_id": m.scene,
+                "rollout_id": f"seed-{m.seed}",
+                "error": "" if m.error is None else m.error.message,
             }
             for m in failed
         ]

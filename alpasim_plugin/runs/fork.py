@@ -36,6 +36,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest
+from alpasim_plugin.log.run_folder.records import Fork
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 from alpasim_plugin.log.trace import first_difference
@@ -256,7 +257,7 @@ def fork_rollout(
             f"--at {change.after_us * 1e-06:g}: nothing changes there",
             "Name a --renderer, a --policy or a --seed; `simrun --repeat` drives a rollout twice.",
         )
-    length_us = int(past.manifest["steps"]) * past.scenario.rates.control_us
+    length_us = (past.manifest.steps or 0) * past.scenario.rates.control_us
     if not 0 <= change.after_us < length_us:
         raise InputError(
             f"--at {change.after_us * 1e-06:g}: the rollout lasts {length_us * 1e-06:g} s",
@@ -276,7 +277,7 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     # Copy the original rollout's folder and return its manifest.
     folder = root / past.cell.folder
     shutil.copytree(past.folder, folder, dirs_exist_ok=True)
-    original = dict(past.manifest) | {"path": past.cell.folder.as_posix(), "reused": True}
+    original = replace(past.manifest, path=past.cell.folder.as_posix(), reused=True)
     write_manifest(folder, original)
     key = digest(
         [
@@ -309,9 +310,9 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     except SimrunError as error:
         manifest = failed_manifest(fork, error)
         write_manifest(root / fork.folder, manifest)
-    if manifest["status"] == "ok":
+    if manifest.ok:
         _check_replay(past, at_us, root / fork.folder)
-        manifest["fork"] = asdict(change) | {"of": past.name, "replay": "equal"}
+        manifest = replace(manifest, fork=Fork(**vars(change), of=past.name, replay="equal"))
         write_manifest(root / fork.folder, manifest)
     cells = (past.cell, fork)
     renderers = (past.cell.renderer, fork.renderer)
@@ -327,7 +328,7 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     info = replace(
         read_run_json(root),
         kind="fork",
-        fork=manifest.get("fork"),
+        fork=manifest.fork,
         pool=pool_of([original, manifest], threads, time.perf_counter() - began, None),
     )
     summary = finish_run(root, info, [original, manifest])

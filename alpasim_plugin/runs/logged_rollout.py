@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.parts import overrides_of, require_installed, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import inspect_rollout, read_run_json
 from alpasim_plugin.log.run_folder.reader import Run
-from alpasim_plugin.log.run_folder.records import RunConfig
+from alpasim_plugin.log.run_folder.records import Manifest, RunConfig
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, cell_name
 from alpasim_plugin.runs.plan import Cell, RunOptions, make_plan, options_of, ref_of
@@ -25,12 +24,12 @@ class LoggedRollout:
     cell: Cell
     options: RunOptions
     scenario: Scenario
-    manifest: JsonView
+    manifest: Manifest
 
     @property
     def folder(self) -> Path:
         """Give the folder with its log."""
-        return self.root / str(self.manifest["path"])
+        return self.root / self.manifest.path
 
     @property
     def name(self) -> str:
@@ -76,10 +75,10 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
             "Give the command of the run again: it drives this rollout.",
         )
     manifest = state.manifest
-    if manifest.get("fork"):
+    if manifest.fork is not None:
         raise InputError(
             f"{name}: it is the continuation of another rollout",
-            f"name that rollout: {manifest['fork']['of']}",
+            f"name that rollout: {manifest.fork.of}",
         )
     stated = info.scenes.get(row.scene)
     if stated is None or stated.ref is None or not isinstance(info.config, RunConfig):
@@ -101,7 +100,7 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
     (cell,) = plan.cells
     loaded = plan.scenarios.get(row.scene)
     difference = ""
-    if cell.rollout_key != manifest["rollout_key"]:
+    if cell.rollout_key != manifest.rollout_key:
         difference = "content key differs"
     if loaded is None:
         difference = f"scenario {ref.path} now has the scene id {cell.scene!r}"

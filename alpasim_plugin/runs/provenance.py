@@ -15,7 +15,7 @@ from alpasim_plugin import __version__
 from alpasim_plugin.core.cores import usable_cores
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec
-from alpasim_plugin.log.run_folder.records import PartFacts, Project
+from alpasim_plugin.log.run_folder.records import Manifest, PartFacts, Project
 from evaluators.results import FixerFacts
 
 PACKAGES = (
@@ -174,7 +174,7 @@ def _no_filters(folder: Path | None) -> list[str]:
     ]
 
 
-def fixers(manifests: Sequence[JsonObject]) -> dict[str, FixerFacts]:
+def fixers(manifests: Sequence[Manifest]) -> dict[str, FixerFacts]:
     """Return what the fixer of each renderer with one did.
 
     Args:
@@ -182,8 +182,8 @@ def fixers(manifests: Sequence[JsonObject]) -> dict[str, FixerFacts]:
     """
     facts: dict[str, list[JsonObject]] = {}
     for manifest in manifests:
-        if manifest.get("fixer"):
-            facts.setdefault(manifest["renderer"], []).append(manifest["fixer"])
+        if manifest.fixer:
+            facts.setdefault(manifest.renderer, []).append(manifest.fixer)
     return {renderer: _fixer_facts(rollouts) for renderer, rollouts in facts.items()}
 
 

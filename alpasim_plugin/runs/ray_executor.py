@@ -15,7 +15,7 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,13 @@ from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunEr
 from alpasim_plugin.core.files import content_of, read_bytes
 from alpasim_plugin.core.files.atomic import disk_error
 from alpasim_plugin.core.files.inputs import ABSENT
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.core.parts.source import code_digest, file_of, package_digest
 from alpasim_plugin.core.subprocesses import own_path_only
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
 from alpasim_plugin.runs.cell import run_cell
 from alpasim_plugin.runs.executor_choice import Executor
@@ -48,7 +48,7 @@ LISTENING_S = 10.0  # how long the head of a cluster may take to accept a connec
 class DrivenRollout:
     """A rollout that a node has driven: its manifest, and its files by name."""
 
-    manifest: JsonObject
+    manifest: Manifest
     files: Mapping[str, bytes]
 
 
@@ -116,7 +116,7 @@ def run_on_ray(
     executor: Executor,
     workers: int,
     limit_s: float | None,
-) -> Iterator[tuple[Cell, JsonObject | Lost]]:
+) -> Iterator[tuple[Cell, Manifest | Lost]]:
     """Yield every rollout with its manifest, as they finish; only this process writes ``root``.
 
     Args:
@@ -176,7 +176,7 @@ def _require_node(ray: Any, executor: Executor) -> None:
         )
 
 
-def _result(ray: Any, task: Any, root: Path) -> JsonObject | Lost:
+def _result(ray: Any, task: Any, root: Path) -> Manifest | Lost:
     """Write a finished rollout into the run folder and return its manifest.
 
     Raises:
@@ -286,18 +286,18 @@ def differences_of(expected: Mapping[str, str], present: Mapping[str, str]) -> l
 def read_rollout(folder: Path, node: str) -> DrivenRollout:
     """Read the folder of a rollout that was just driven; of a failed one what its parts printed."""
     manifest = read_manifest(folder)
-    names = [*manifest["files"]] or [OUTPUT_NAME]
+    names = [*manifest.files] or [OUTPUT_NAME]
     files = {name: read_bytes(folder / name) for name in names if os.path.exists(folder / name)}
-    return DrivenRollout({"node": node, **manifest}, files)
+    return DrivenRollout(replace(manifest, node=node), files)
 
 
-def write_rollout(rollout: DrivenRollout, root: Path) -> JsonObject:
+def write_rollout(rollout: DrivenRollout, root: Path) -> Manifest:
     """Write a rollout below a run folder, its manifest last, and return the manifest.
 
     Raises:
         InfrastructureError: The disk refuses.
     """
-    folder = root / rollout.manifest["path"]
+    folder = root / rollout.manifest.path
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for path in folder.iterdir():
@@ -306,6 +306,6 @@ def write_rollout(rollout: DrivenRollout, root: Path) -> JsonObject:
             (folder / name).write_bytes(data)
     except OSError as error:
         raise disk_error(folder, error) from error
-    manifest = {name: value for name, value in rollout.manifest.items() if name != "files"}
+    manifest = replace(rollout.manifest, files={})
     write_manifest(folder, manifest)
     return manifest

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.core.files.atomic import scratch_folder
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log import read_facts
 from alpasim_plugin.log.run_folder.checksums import checksums_of
-from alpasim_plugin.log.run_folder.records import CellNames, LogDifference, Repeat
+from alpasim_plugin.log.run_folder.records import CellNames, LogDifference, Manifest, Repeat
 from alpasim_plugin.log.run_folder.schema import FRAMES_NAME, LOG_NAME, cell_name
 from alpasim_plugin.log.trace import Trace, first_difference, trace_log
 from alpasim_plugin.runs.cell import run_cell, users_parts
@@ -23,7 +22,7 @@ def log_trace(folder: Path) -> Trace:
 
 
 def repeat_rollout(
-    plan: RunPlan, root: Path, manifests: Sequence[JsonView], threads: int
+    plan: RunPlan, root: Path, manifests: Sequence[Manifest], threads: int
 ) -> Repeat:
     """Drive the shortest finished rollout of each policy again and compare the two logs.
 
@@ -43,7 +42,7 @@ def repeat_rollout(
     finished = [
         cell
         for cell, manifest in zip(plan.cells, manifests, strict=True)
-        if manifest["status"] == "ok" and plan.scenarios[cell.scene].latency.kind != "measured"
+        if manifest.ok and plan.scenarios[cell.scene].latency.kind != "measured"
     ]
     longest_first = sorted(
         finished,
@@ -67,8 +66,8 @@ def _driven_twice(plan: RunPlan, root: Path, cell: Cell, threads: int) -> Repeat
             again = apart(work, cell, users_parts(cell), threads)
         except SimrunError as error:
             return _not_compared(f"the second rollout failed: {error.message}")
-        if again["status"] != "ok":
-            return _not_compared(f"the second rollout failed: {again['error']['message']}")
+        if again.error is not None:
+            return _not_compared(f"the second rollout failed: {again.error.message}")
         first = log_trace(folder)
         second = log_trace(scratch / cell.folder)
         digests = [

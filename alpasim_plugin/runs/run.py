@@ -12,7 +12,6 @@ from alpasim_plugin import __version__
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real, some_of
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.log.run_folder.check import cells_of_run, inspect_files
@@ -20,6 +19,7 @@ from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
 from alpasim_plugin.log.run_folder.reader import REMADE
 from alpasim_plugin.log.run_folder.records import (
+    Manifest,
     RunConfig,
     RunCounts,
     RunInfo,
@@ -67,7 +67,7 @@ class Progress(Protocol):
         """Announce the run."""
         ...
 
-    def rollout_done(self, manifest: JsonObject, reused: bool) -> None:
+    def rollout_done(self, manifest: Manifest, reused: bool) -> None:
         """Announce one rollout."""
         ...
 
@@ -98,13 +98,13 @@ class Search(Protocol):
     plan: RunPlan
     ceiling: RunPlan
     at_once: int
-    driven: dict[str, JsonObject]
+    driven: dict[str, Manifest]
 
     def next_plan(self) -> RunPlan | None:
         """Return the rollouts of the next round; None where the search has ended."""
         ...
 
-    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
+    def add(self, plan: RunPlan, manifests: Sequence[Manifest]) -> None:
         """Take in the outcomes of a round."""
         ...
 
@@ -141,11 +141,10 @@ class RunResult:
         return self.outcome.exit_code
 
 
-def on_done(progress: Progress) -> Callable[[JsonObject, bool], None]:
-    """Return what notes in a manifest whether its rollout was reused, and then announces it."""
+def on_done(progress: Progress) -> Callable[[Manifest, bool], None]:
+    """Return what announces a rollout, and whether it was reused."""
 
-    def done(manifest: JsonObject, reused: bool) -> None:
-        manifest["reused"] = reused
+    def done(manifest: Manifest, reused: bool) -> None:
         progress.rollout_done(manifest, reused)
 
     return done
@@ -272,7 +271,7 @@ def execute_search(
 
 
 def finish_run(
-    root: Path, info: RunInfo, manifests: Sequence[JsonObject], report: bool = True
+    root: Path, info: RunInfo, manifests: Sequence[Manifest], report: bool = True
 ) -> Summary:
     """Write the tables and the reports of a run whose rollouts are done; return the summary.
 
@@ -285,10 +284,10 @@ def finish_run(
         manifests: One per rollout, in the order of the tables.
         report: Write ``report.html``.
     """
-    n_failed = sum(manifest["status"] != "ok" for manifest in manifests)
+    n_failed = sum(not manifest.ok for manifest in manifests)
     outcome = RunCounts(len(manifests), n_failed)  # for lists of many runs
     info = replace(info, outcome=outcome, rollouts=None)
-    folders = tuple(manifest["path"] for manifest in manifests)
+    folders = tuple(manifest.path for manifest in manifests)
     if folders != cells_of_run(info):
         info = replace(info, rollouts=folders)
     write_run_json(root, info)

@@ -2,11 +2,10 @@
 
 import base64
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files import read_json_object
@@ -19,6 +18,7 @@ from alpasim_plugin.log import encode_image, read_asl
 from alpasim_plugin.log.debug import WIDTH_PX
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.manifests import read_manifest
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import LOG_NAME, SAME_POSES
 from alpasim_plugin.runs.cameras import logged_request
 from alpasim_plugin.runs.guards import checked_frames
@@ -32,7 +32,7 @@ FRAMES = 10  # before the failure, one after the other: a fixer has a history
 
 
 def store_same_poses(
-    plan: RunPlan, root: Path, manifests: Sequence[Mapping[str, Any]], threads: int
+    plan: RunPlan, root: Path, manifests: Sequence[Manifest], threads: int
 ) -> None:
     """Write ``same_poses.json`` for the first failures of a run with several renderers: by renderer,
     time and JPEG of each image in base64, of the policy's first camera. A file that was made of the
@@ -44,17 +44,18 @@ def store_same_poses(
         return
     cells = {cell.folder.as_posix(): cell for cell in plan.cells}
     # As they are stored: with the digests of the rollouts' files, which belong to the key.
-    stored = [read_manifest(root / manifest["path"]) for manifest in manifests]
-    failures = [manifest for manifest in stored if manifest["status"] == "ok"]
-    failures = [manifest for manifest in failures if first_failure(manifest)]
+    stored = [read_manifest(root / manifest.path) for manifest in manifests]
+    failures = [manifest for manifest in stored if manifest.ok]
+    failures = [manifest for manifest in failures if first_failure(manifest.events)]
     for manifest in failures[:MOST_FAILURES]:
-        cell = cells[manifest["path"]]
+        cell = cells[manifest.path]
         path = root / cell.folder / SAME_POSES
         key = images_key(plan, cell, manifest, stored)
         if _key_in(path) == key:
             continue
         log = read_asl(root / cell.folder / LOG_NAME)
-        failed_us = int((first_failure(manifest) or {})["t_us"])
+        failure = first_failure(manifest.events)
+        failed_us = 0 if failure is None else failure.t_us
         work = partial(_images, plan, cell, log=log, failed_us=failed_us, threads=threads)
         others = [spec for spec in plan.renderers if spec.name != cell.renderer.name]
         images_by_renderer = {spec.name: _images_apart(work, spec, threads) for spec in others}
@@ -77,8 +78,8 @@ def _images_apart(
 def images_key(
     plan: RunPlan,
     cell: Cell,
-    manifest: Mapping[str, Any],
-    manifests: Sequence[Mapping[str, Any]],
+    manifest: Manifest,
+    manifests: Sequence[Manifest],
 ) -> str:
     """Return the key of the images of a failure: of the log, of what the other renderers are, and of
     the rollouts of those that have no digest.
@@ -87,13 +88,13 @@ def images_key(
     inputs.setting("simrun", package_digest())
     inputs.setting("scene", cell.content_hash)
     inputs.setting("device", plan.options.device)
-    inputs.setting("log", manifest["files"][LOG_NAME]["sha256"])
+    inputs.setting("log", manifest.files[LOG_NAME]["sha256"])
     inputs.setting("renderers", {spec.name: spec.digest for spec in plan.renderers})
     remote = {spec.name for spec in plan.renderers if spec.digest is None}
     driven = [
-        (other["path"], other["files"].get(LOG_NAME, {}).get("sha256"))
+        (other.path, other.files[LOG_NAME]["sha256"] if LOG_NAME in other.files else None)
         for other in manifests
-        if other["renderer"] in remote and other["scene"] == cell.scene
+        if other.renderer in remote and other.scene == cell.scene
     ]
     inputs.setting("rollouts of remote renderers", driven)
     return inputs.key

@@ -15,8 +15,15 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, digest
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.run_folder import records
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest, write_run_json
-from alpasim_plugin.log.run_folder.records import RunInfo, SceneFacts, ScoreConfig
+from alpasim_plugin.log.run_folder.records import (
+    Manifest,
+    MetricValue,
+    RunInfo,
+    SceneFacts,
+    ScoreConfig,
+)
 from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
 from alpasim_plugin.log.run_folder.writer import (
     LoggedScene,
@@ -44,7 +51,6 @@ from evaluators.alpasim import (
 from evaluators.metrics import METRICS, table_of
 from evaluators.metrics.presets import Preset
 from evaluators.results import Summary, to_json
-from evaluators.statistics.reduce import RolloutValue
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ def execute_score(
     evaluators: Sequence[PartSpec],
     root: Path | None,
     command: Sequence[str],
-    on_done: Callable[[JsonObject], None],
+    on_done: Callable[[Manifest], None],
     noticed: Callable[[str], None],
 ) -> ScoreResult:
     """Score logs and write run.json, the tables, the reports, and with preset ``alpasim`` its
@@ -123,7 +129,7 @@ def execute_score(
             aggregation, error = _aggregate(scores, preset, settings, root / AGGREGATE)
         manifests = [one.manifest for one in scores]
         for manifest in manifests:
-            write_manifest(root / manifest["path"], manifest)
+            write_manifest(root / manifest.path, manifest)
         used = _write_scenes(root, scores, scenes)
         info = _run_info(key, scores, used, preset, settings, command, evaluators)
         write_run_json(root, info)
@@ -143,7 +149,7 @@ def _aggregate(
     An error of the scene score leaves the values of the rollouts.
     """
     good = [log_score.manifest for log_score in scores if log_score.scored is not None]
-    has_images = any(manifest["frames"] for manifest in good)
+    has_images = any(manifest.frames for manifest in good)
     failed = [log_score.manifest for log_score in scores if log_score.scored is None]
     reduced = []
     marks: dict[int, SceneScore] | None = {}
@@ -160,16 +166,18 @@ def _aggregate(
     except EvaluatorError as caught:
         error = caught
         marks = None
-    for number, (manifest, rollout) in enumerate(zip(good, reduced, strict=False)):
+    finished = [log_score for log_score in scores if log_score.scored is not None]
+    for number, (log_score, rollout) in enumerate(zip(finished, reduced, strict=False)):
         values = dict(rollout.reduction.values)
         mark = (marks or {}).get(number)
         if mark is not None:
             metric = METRICS["scene_score"]
-            values["scene_score"] = RolloutValue(
-                mark.score, True, "", metric.unit, metric.direction
-            )
-        manifest["metrics"] = {name: value.as_dict() for name, value in values.items()}
-        manifest["scene_score"] = mark and {"failure_reason": mark.failure_reason}
+            values["scene_score"] = MetricValue(mark.score, True, "", metric.unit, metric.direction)
+        log_score.manifest = replace(
+            log_score.manifest,
+            metrics=values,
+            scene_score=None if mark is None else records.SceneScore(mark.failure_reason),
+        )
     facts: JsonObject = {
         "folder": AGGREGATE,
         "files": [],
@@ -192,7 +200,7 @@ def _write_aggregate(
     folder: Path,
     reduced: Sequence[Any],
     marks: dict[int, SceneScore] | None,
-    failed: Sequence[JsonObject],
+    failed: Sequence[Manifest],
     settings: EvalSettings,
 ) -> list[str]:
     """Write AlpaSim's files and return their names; without ``marks`` no summary."""
@@ -209,11 +217,11 @@ def _write_aggregate(
         return files
     rows = [
         {
-            "clipgt_id": manifest["scene"],
-            "rollout_id": manifest["rollout"],
+            "clipgt_id": manifest.scene,
+            "rollout_id": manifest.rollout,
             "run_uuid": None,
             "run_name": scored_rollouts[0].run_name,
-            "error": manifest["error"]["message"],
+            "error": "" if manifest.error is None else manifest.error.message,
         }
         for manifest in failed
     ]
@@ -227,7 +235,7 @@ def _write_scenes(
 ) -> dict[str, Scenario | LoggedScene]:
     """Write the files of the scenes in which logs were scored, and return them by id."""
     used = {
-        log_score.manifest["scene"]: scenes.of(log_score.manifest["scene"])
+        log_score.manifest.scene: scenes.of(log_score.manifest.scene)
         for log_score in scores
         if log_score.scored is not None
     }
@@ -255,9 +263,9 @@ def _run_info(
             settings=None if settings is None else settings.model_dump(mode="json"),
         ),
         preset=preset.name,
-        renderers=tuple(dict.fromkeys(manifest["renderer"] for manifest in manifests)),
-        policies=tuple(dict.fromkeys(manifest["policy"] for manifest in manifests)),
-        seeds=tuple(dict.fromkeys(manifest["seed"] for manifest in manifests)),
+        renderers=tuple(dict.fromkeys(manifest.renderer for manifest in manifests)),
+        policies=tuple(dict.fromkeys(manifest.policy for manifest in manifests)),
+        seeds=tuple(dict.fromkeys(manifest.seed for manifest in manifests)),
         scenes={
             name: SceneFacts(
                 source=scene.source,
@@ -277,5 +285,5 @@ def _run_info(
         hardware=hardware(),
         versions=versions(),
         left_out=tuple(sorted(left_out)),
-        logs=tuple(dict.fromkeys(manifest["log"] for manifest in manifests)),
+        logs=tuple(dict.fromkeys(manifest.log or "" for manifest in manifests)),
     )

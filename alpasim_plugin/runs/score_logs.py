@@ -23,19 +23,19 @@ from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
-from alpasim_plugin.log.run_folder.records import SceneFacts
+from alpasim_plugin.log.run_folder.records import Manifest, SceneFacts
 from alpasim_plugin.log.run_folder.schema import (
     KEYS,
     LOG_NAME,
     MANIFEST,
     RUN_INFO,
-    SCORE_INPUTS,
     rollout_folder,
 )
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
+from alpasim_plugin.runs.cell import error_of
 from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.plan import ref_of
-from alpasim_plugin.runs.scoring import tabulate
+from alpasim_plugin.runs.scoring import Scores, tabulate
 from evaluators import score
 from evaluators.alpasim import ScoredRollout
 from evaluators.metrics.presets import Preset
@@ -49,11 +49,11 @@ SKIPPED = "<skip>"
 SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")
 
 
-@dataclass(frozen=True)
+@dataclass
 class LogScore:
     """Result of one log."""
 
-    manifest: JsonObject
+    manifest: Manifest
     scored: ScoredRollout | None  # None if the log could not be scored
 
 
@@ -102,7 +102,7 @@ def score_logs(
     preset: Preset,
     evaluators: Sequence[PartSpec],
     root: Path,
-    on_done: Callable[[JsonObject], None],
+    on_done: Callable[[Manifest], None],
 ) -> list[LogScore]:
     """Score every log against its scene and write its steps.
 
@@ -119,7 +119,8 @@ def score_logs(
     for log in logs:
         began = time.perf_counter()
         log_score = _score(log, scenes, preset, evaluators, root, taken, names)
-        log_score.manifest["wall_s"] = round(time.perf_counter() - began, 4)
+        wall_s = round(time.perf_counter() - began, 4)
+        log_score.manifest = replace(log_score.manifest, wall_s=wall_s)
         scores.append(log_score)
         on_done(log_score.manifest)
     return scores
@@ -135,16 +136,19 @@ def _score(
     names: set[str],
 ) -> LogScore:
     name = real(log).parent.name
-    manifest: JsonObject = {
-        "renderer": UNKNOWN,
-        "policy": UNKNOWN,
-        "scene": UNKNOWN,
-        "seed": 0,
-        "rollout": name,
-        "log": str(log),
-        "preset": preset.name,
-        "reused": True,  # nothing was rendered, so these rows have no speed
-    }
+    manifest = Manifest(
+        renderer=UNKNOWN,
+        policy=UNKNOWN,
+        scene=UNKNOWN,
+        seed=0,
+        path="",
+        status="failed",
+        wall_s=None,
+        rollout=name,
+        log=str(log),
+        preset=preset.name,
+        reused=True,  # nothing was rendered, so these rows have no speed
+    )
     try:
         check_vouched(log)
         rollout = read_asl(log)
@@ -154,7 +158,7 @@ def _score(
     session = rollout.session_uuid or name
     session = session if session not in names else f"{session} ({name})"
     names.add(session)
-    manifest |= _log_facts(rollout, session)
+    manifest = _with_log_facts(manifest, rollout, session)
     # A wrong --scene is an error of the command, not of the log.
     scene = scenes.of(rollout.scene_id, log).scene
     cameras = {image.camera for image in rollout.images}
@@ -165,42 +169,44 @@ def _score(
         parts = ", ".join(part.name for part in evaluators if part.is_users)
         if parts:
             work = partial(_values_of_log, preset=preset, evaluators=evaluators)
-            series, rows, facts = apart(work, (log, scene), parts, 1)
+            series, rows, scores, read = apart(work, (log, scene), parts, 1)
         else:
-            series, rows, facts = _values(rollout, scene, preset, evaluators)
+            series, rows, scores, read = _values(rollout, scene, preset, evaluators)
     except SimrunError as error:
         return _failed(manifest, error, root, taken)
-    manifest |= {"status": "ok", "path": _folder(manifest, taken)} | facts
-    keys = {key: manifest[key] for key in (*KEYS, "rollout")}
-    write_steps(root / manifest["path"], [keys | row for row in rows], of_logs=True)
+    path = _folder(manifest, taken)
+    manifest = replace(scores.stated_in(manifest), status="ok", path=path, score_inputs=read)
+    keys = dict(zip(KEYS, manifest.cell, strict=True)) | {"rollout": session}
+    write_steps(root / manifest.path, [keys | row for row in rows], of_logs=True)
     run_uuid, run_name = run_names(log)
-    return LogScore(
-        manifest, ScoredRollout(rollout.scene_id, manifest["rollout"], series, run_uuid, run_name)
-    )
+    return LogScore(manifest, ScoredRollout(rollout.scene_id, session, series, run_uuid, run_name))
 
 
-def _log_facts(rollout: RolloutLog, session: str) -> JsonObject:
-    """Return the members of a manifest that the log itself states.
+def _with_log_facts(manifest: Manifest, rollout: RolloutLog, session: str) -> Manifest:
+    """Return a manifest with the members that the log itself states.
 
     Args:
+        manifest: So far.
         rollout: The log.
         session: Name of the rollout.
     """
     versions = rollout.info["versions"]
-    return {
-        "renderer": _named(versions.get("sensorsim"), versions.get("video_model")),
-        "policy": _named(versions.get("egodriver")),
-        "scene": rollout.scene_id,
-        "seed": int(rollout.seed) & (2**63 - 1),
-        "rollout": session,
-        "session_uuid": rollout.session_uuid,
-        "frames": len(rollout.images),
-        "steps": _steps(rollout),
-        "warnings": list(rollout.warnings),
-    }
+    return replace(
+        manifest,
+        renderer=_named(versions.get("sensorsim"), versions.get("video_model")),
+        policy=_named(versions.get("egodriver")),
+        scene=rollout.scene_id,
+        seed=int(rollout.seed) & (2**63 - 1),
+        rollout=session,
+        session_uuid=rollout.session_uuid,
+        frames=len(rollout.images),
+        steps=_steps(rollout),
+        warnings=tuple(rollout.warnings),
+    )
 
 
-Values = tuple[tuple[MetricSeries, ...], list[JsonObject], JsonObject]
+# The series of a log, its rows of steps.parquet, its scores, and what evaluators read.
+Values = tuple[tuple[MetricSeries, ...], list[JsonObject], Scores, dict[str, str]]
 
 
 def _values_of_log(
@@ -219,10 +225,10 @@ def _values(
     """
     with Inputs() as inputs:
         series = tuple(score(rollout, scene, preset, evaluators))
-    rows, facts = tabulate(rollout, series, preset)
+    rows, scores = tabulate(rollout, series, preset)
     stated = {path for part in evaluators for path in (*part.code, *part.files)}
     read = {path: content for path, content in inputs.files.items() if path not in stated}
-    return series, rows, facts | {SCORE_INPUTS: read}
+    return series, rows, scores, read
 
 
 def check_vouched(log: Path) -> None:
@@ -235,7 +241,7 @@ def check_vouched(log: Path) -> None:
     if log.name != LOG_NAME or not os.path.exists(log.parent / MANIFEST):
         return
     try:
-        facts = read_manifest(log.parent)["files"].get(LOG_NAME)
+        facts = read_manifest(log.parent).files.get(LOG_NAME)
         problem = None if facts is None else problem_of(log, facts, full=True)
     except InputError as error:
         problem = f"its {MANIFEST} is damaged: {error.message}"
@@ -305,17 +311,18 @@ def run_names(log: Path) -> tuple[str | None, str | None]:
     return None, None
 
 
-def _failed(manifest: JsonObject, error: SimrunError, root: Path, taken: set[str]) -> LogScore:
-    manifest |= {"status": "failed", "error": error.as_dict(), "path": _folder(manifest, taken)}
-    return LogScore(manifest, None)
+def _failed(manifest: Manifest, error: SimrunError, root: Path, taken: set[str]) -> LogScore:
+    path = _folder(manifest, taken)
+    return LogScore(replace(manifest, error=error_of(error), path=path), None)
 
 
-def _folder(manifest: JsonObject, taken: set[str]) -> str:
+def _folder(manifest: Manifest, taken: set[str]) -> str:
     """Return the folder of a log's results, relative to the run folder; logs with the same names
     get numbers.
     """
-    names = [str(manifest[key]) for key in ("renderer", "policy", "scene", "rollout")]
-    base = rollout_folder(*names).as_posix()
+    base = rollout_folder(
+        manifest.renderer, manifest.policy, manifest.scene, manifest.rollout or UNKNOWN
+    ).as_posix()
     path = base
     number = 2
     while path in taken:
@@ -336,9 +343,7 @@ def exit_code(
     scored, 4 for a rollout cut short.
     """
     classes = {
-        log_score.manifest["error"]["failure_class"]
-        for log_score in scores
-        if log_score.manifest["status"] != "ok"
+        log_score.manifest.failure_class for log_score in scores if not log_score.manifest.ok
     }
     if "input" in classes:
         return 2

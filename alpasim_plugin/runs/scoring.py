@@ -1,6 +1,7 @@
 """Score one rollout from its log and flatten the result for the tables."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from alpasim_plugin.core.types import (
     Scenario,
 )
 from alpasim_plugin.log import read_asl, read_facts
+from alpasim_plugin.log.run_folder.records import Contact, DriveEvent, Ledger, Manifest, MetricValue
 from evaluators import Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
 from evaluators.metrics.route import lateral_bias
@@ -28,13 +30,33 @@ from evaluators.metrics.route import lateral_bias
 FIXER_FACTS = ("pose_error_m", "forecast_error_m", RECORDED_SHARE, GUESSED_SHARE)
 
 
+@dataclass(frozen=True)
+class Scores:
+    """What scoring adds to a manifest; see `alpasim_plugin.log.run_folder.records.Manifest`."""
+
+    metrics: dict[str, MetricValue]
+    events: tuple[DriveEvent, ...]
+    contacts: tuple[Contact, ...]
+    censored: Ledger
+
+    def stated_in(self, manifest: Manifest) -> Manifest:
+        """Return a manifest with the scores."""
+        return replace(
+            manifest,
+            metrics=self.metrics,
+            events=self.events,
+            contacts=self.contacts,
+            censored=self.censored,
+        )
+
+
 def score_log(
     log: Path,
     frames: Path,
     scenario: Scenario,
     preset: str,
     evaluators: Sequence[PartSpec] | None = None,
-) -> tuple[list[JsonObject], JsonObject]:
+) -> tuple[list[JsonObject], Scores]:
     """Read a log and score it as `tabulate` does; the scores depend on the written log alone.
 
     Raises:
@@ -50,7 +72,7 @@ def tabulate(
     series: Sequence[MetricSeries],
     preset: str | Preset,
     frames: Sequence[JsonView] = (),
-) -> tuple[list[JsonObject], JsonObject]:
+) -> tuple[list[JsonObject], Scores]:
     """Flatten a scored rollout for the tables.
 
     Args:
@@ -60,10 +82,7 @@ def tabulate(
         frames: Facts per camera frame, if known.
 
     Returns:
-        Rows of ``steps.parquet`` without the rollout's key; and for the manifest ``metrics`` (value,
-        valid, reason, unit and direction of each), ``events`` (when and where outcomes began),
-        ``contacts`` (onsets, if contact is searched between steps) and ``censored`` (how many steps
-        each rule removed).
+        Rows of ``steps.parquet`` without the rollout's key; and what the manifest says.
     """
     reduction = reduce_rollout(series, preset)
     chosen = find_preset(preset)
@@ -89,12 +108,13 @@ def tabulate(
         rows.append(_row(facts["t_us"], "opacity_mean", opacity, "the renderer gives no opacity"))
     for name in FIXER_FACTS:
         rows += [_row(facts["t_us"], name, facts[name]) for facts in frames if name in facts]
-    return rows, {
-        "metrics": reduction.as_dict(),
-        "events": _placed(rollout, reduction),
-        "contacts": [contact.as_dict() for contact in contacts],
-        "censored": reduction.ledger.as_dict(),
-    }
+    scores = Scores(
+        metrics=reduction.values,
+        events=_placed(rollout, reduction),
+        contacts=tuple(contact.rounded() for contact in contacts),
+        censored=reduction.ledger,
+    )
+    return rows, scores
 
 
 def _ego_rows(rollout: RolloutLog) -> list[JsonObject]:
@@ -131,18 +151,19 @@ def _speeds(t_us: I64, xyz: F64) -> F64:
     return np.linalg.norm(np.gradient(xyz[:, :2], seconds, axis=0), axis=1)
 
 
-def _placed(rollout: RolloutLog, reduction: Reduction) -> list[JsonObject]:
+def _placed(rollout: RolloutLog, reduction: Reduction) -> tuple[DriveEvent, ...]:
     """Return the events with the position of the ego's box centre."""
     placed = []
     for event in reduction.events:
         position = rollout.ego.xyz[int(np.searchsorted(rollout.ego.t_us, event["t_us"]))]
         after_s = round((int(event["t_us"]) - rollout.render_start_us) * 1e-6, 3)
         placed.append(
-            dict(event)
-            | {
-                "t_s": after_s,
-                "x_m": round(float(position[0]), 3),
-                "y_m": round(float(position[1]), 3),
-            }
+            DriveEvent(
+                metric=event["metric"],
+                t_us=event["t_us"],
+                t_s=after_s,
+                x_m=round(float(position[0]), 3),
+                y_m=round(float(position[1]), 3),
+            )
         )
-    return sorted(placed, key=lambda event: (event["t_us"], event["metric"]))
+    return tuple(sorted(placed, key=lambda event: (event.t_us, event.metric)))

@@ -14,12 +14,11 @@ import pyarrow as pa
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
 from alpasim_plugin.core.files.atomic import write_json
-from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
-from alpasim_plugin.log.run_folder.records import Pool, RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, Pool, RunInfo
 from alpasim_plugin.log.run_folder.rows import rollouts_of_table
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS, SUMMARY
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, SUMMARY
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
@@ -29,7 +28,6 @@ from evaluators.metrics import MetricTable
 from evaluators.results import (
     FailedRollout,
     Failures,
-    RolloutError,
     Speed,
     StageSpeed,
     Summary,
@@ -41,7 +39,7 @@ from evaluators.statistics.variants import base_named, variants_in
 
 
 def write_summary(
-    root: Path, info: RunInfo, manifests: Sequence[JsonObject], tables: Path
+    root: Path, info: RunInfo, manifests: Sequence[Manifest], tables: Path
 ) -> Summary:
     """Write the tables and ``summary.json`` of a run folder and return the summary.
 
@@ -57,7 +55,7 @@ def write_summary(
     return summary
 
 
-def summary_of(info: RunInfo, manifests: Sequence[JsonObject], rollouts: pa.Table) -> Summary:
+def summary_of(info: RunInfo, manifests: Sequence[Manifest], rollouts: pa.Table) -> Summary:
     """Return the results of a run.
 
     Args:
@@ -73,7 +71,7 @@ def summary_of(info: RunInfo, manifests: Sequence[JsonObject], rollouts: pa.Tabl
     means = numbers(table, info.baseline, info.bases, metric_table)
     of_policy = _of_policies(manifests)
     finished = {
-        policy: [manifest for manifest in policy_manifests if manifest["status"] == "ok"]
+        policy: [manifest for manifest in policy_manifests if manifest.ok]
         for policy, policy_manifests in of_policy.items()
     }
     return Summary(
@@ -90,7 +88,7 @@ def summary_of(info: RunInfo, manifests: Sequence[JsonObject], rollouts: pa.Tabl
                 for policy, policy_manifests in of_policy.items()
             }
         ),
-        copies=sum("copied_from" in manifest for manifest in manifests),
+        copies=sum(manifest.copied_from is not None for manifest in manifests),
         fixers=by_policy(
             {policy: fixers(policy_manifests) for policy, policy_manifests in finished.items()}
         ),
@@ -105,47 +103,45 @@ def summary_of(info: RunInfo, manifests: Sequence[JsonObject], rollouts: pa.Tabl
     )
 
 
-def _invalid_reasons(manifests: Sequence[JsonObject]) -> dict[tuple[str, str], str]:
+def _invalid_reasons(manifests: Sequence[Manifest]) -> dict[tuple[str, str], str]:
     """Return for each renderer and metric why rollouts have no valid value: the most frequent
     reason.
     """
     counts: dict[tuple[str, str], Counter[str]] = {}
     for manifest in manifests:
-        for metric, entry in manifest["metrics"].items() if manifest["status"] == "ok" else ():
-            if not entry["valid"] and entry["reason"]:
-                key = manifest["renderer"], metric
-                counts.setdefault(key, Counter())[entry["reason"]] += 1
+        for metric, entry in manifest.metrics.items() if manifest.ok else ():
+            if not entry.valid and entry.reason:
+                key = manifest.renderer, metric
+                counts.setdefault(key, Counter())[entry.reason] += 1
     return {key: reasons.most_common(1)[0][0] for key, reasons in counts.items()}
 
 
-def failures_of(manifests: Sequence[JsonObject]) -> Failures:
+def failures_of(manifests: Sequence[Manifest]) -> Failures:
     """Return which rollouts could not be run or scored, and how many of each class."""
-    failed = [manifest for manifest in manifests if manifest["status"] != "ok"]
+    failed = [manifest for manifest in manifests if not manifest.ok]
     cells = tuple(
-        FailedRollout(
-            **{key: manifest[key] for key in (*KEYS, "path")},
-            error=RolloutError(**manifest["error"]),
-        )
+        FailedRollout(*manifest.cell, path=manifest.path, error=manifest.error)
         for manifest in failed
+        if manifest.error is not None
     )
     by_class = Counter(cell.error.failure_class for cell in cells)
     return Failures(len(failed), len(manifests), dict(by_class), cells)
 
 
-def _of_policies(manifests: Sequence[JsonObject]) -> dict[str, list[JsonObject]]:
-    manifests_by_policy: dict[str, list[JsonObject]] = {}
+def _of_policies(manifests: Sequence[Manifest]) -> dict[str, list[Manifest]]:
+    manifests_by_policy: dict[str, list[Manifest]] = {}
     for manifest in manifests:
-        manifests_by_policy.setdefault(manifest["policy"], []).append(manifest)
+        manifests_by_policy.setdefault(manifest.policy, []).append(manifest)
     return manifests_by_policy
 
 
-def _speeds(manifests: Sequence[JsonObject]) -> dict[str, Speed]:
-    timed = [manifest for manifest in manifests if manifest.get("stage_ms")]
-    renderers = dict.fromkeys(manifest["renderer"] for manifest in timed)
-    return {name: speed([m for m in timed if m["renderer"] == name]) for name in renderers}
+def _speeds(manifests: Sequence[Manifest]) -> dict[str, Speed]:
+    timed = [manifest for manifest in manifests if manifest.stage_ms]
+    renderers = dict.fromkeys(manifest.renderer for manifest in timed)
+    return {name: speed([m for m in timed if m.renderer == name]) for name in renderers}
 
 
-def speed(manifests: Sequence[JsonObject]) -> Speed:
+def speed(manifests: Sequence[Manifest]) -> Speed:
     """Return time per camera frame, all-in and by stage, over rollouts of one renderer.
 
     A frame's time is the sum of all stages of the loop between two frames; the time of a block is
@@ -156,10 +152,10 @@ def speed(manifests: Sequence[JsonObject]) -> Speed:
     first = []
     per_frame = []
     for manifest in manifests:
-        frames = max(int(manifest["frames"]), 1)
-        opening = max(int(manifest.get("first_call_frames", 1)), 1)
+        frames = max(manifest.frames or 0, 1)
+        opening = max(manifest.first_call_frames or 0, 1)
         total = np.zeros(frames)
-        for stage, durations in manifest["stage_ms"].items():
+        for stage, durations in manifest.stage_ms.items():
             done = np.concatenate([[0.0], np.cumsum(durations)])
             total += np.diff(
                 np.interp(np.linspace(0, len(durations), frames + 1), np.arange(len(done)), done)
@@ -197,7 +193,7 @@ def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed
 
 
 def pool_of(
-    manifests: Sequence[JsonObject],
+    manifests: Sequence[Manifest],
     threads: Threads,
     wall_s: float,
     before: Pool | None,
@@ -213,10 +209,10 @@ def pool_of(
         before: What the folder says so far.
         executor: Where rollouts ran; None: on this machine.
     """
-    fresh = [m for m in manifests if not m.get("reused")]
+    fresh = [m for m in manifests if not m.reused]
     if not fresh and before is not None:
         return replace(before, executor=before.executor or executor)
-    frames = sum(int(m.get("frames") or 0) for m in fresh)
+    frames = sum((m.frames or 0) for m in fresh)
     has_speed = frames > 0 and wall_s > 0
     return Pool(
         workers=threads.workers,

@@ -20,7 +20,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.parts import digest
 from alpasim_plugin.core.seeding import POINT
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.runs.plan import Cell, RunPlan
 from alpasim_plugin.runs.run import Progress
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
@@ -144,7 +144,7 @@ class BoundarySearch:
     plan: RunPlan
     sweeps: tuple[Sweep, ...]
     make: MakePlan
-    driven: dict[str, JsonObject] = field(default_factory=dict)
+    driven: dict[str, Manifest] = field(default_factory=dict)
     cells: list[Cell] = field(default_factory=list)
     scenes: dict[tuple[float, ...], RunPlan] = field(default_factory=dict)
     unreachable: dict[tuple[float, ...], InputError] = field(default_factory=dict)
@@ -271,21 +271,20 @@ class BoundarySearch:
         """Return ``run.json`` with the record."""
         return replace(info, boundary=self.record())
 
-    def add(self, plan: RunPlan, manifests: Sequence[JsonObject]) -> None:
+    def add(self, plan: RunPlan, manifests: Sequence[Manifest]) -> None:
         """Take in the outcomes of a round."""
         for cell, manifest in zip(plan.cells, manifests, strict=True):
             self.cells.append(cell)
             self.driven[cell.folder.as_posix()] = manifest
-            if manifest["status"] != "ok":
-                failed = True if manifest["error"]["failure_class"] == POLICY_FAULT else None
+            if not manifest.ok:
+                failed = True if manifest.failure_class == POLICY_FAULT else None
             else:
-                metrics = manifest["metrics"]
+                metrics = manifest.metrics
                 measured = [metrics[name] for name in OUTCOMES if name in metrics]
-                failed = any(one["valid"] and one["value"] >= 0.5 for one in measured)
-                validities = [
-                    metrics.get(name, {}).get("valid") for name in ("collision_any", "offroad")
-                ]
-                if not failed and not all(validities):
+                failed = any(one.value is not None and one.value >= 0.5 for one in measured)
+                needed = ("collision_any", "offroad")
+                is_known = all(name in metrics and metrics[name].valid for name in needed)
+                if not failed and not is_known:
                     failed = None  # it is not known
             if failed is None:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"

@@ -31,7 +31,7 @@ from alpasim_plugin.gaussians.files.packed import COMPRESSED, SPZ
 from alpasim_plugin.gaussians.files.ply import PLY
 from alpasim_plugin.gaussians.files.sog import SOG
 from alpasim_plugin.gaussians.fit.photographs import TRANSFORMS
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
 from evaluators.results import Summary
@@ -230,7 +230,10 @@ def run_page() -> str:
     """Return docs/runs.md with the members of the JSON files of a run folder."""
     text = (DOCS / "runs.md").read_text(encoding="utf-8")
     text = replaced(text, "run.json", record_tables(RunInfo, [MetricInfo]))
-    return replaced(text, "summary.json", record_tables(Summary, [*records_in(RunInfo)]))
+    text = replaced(text, "manifest.json", record_tables(Manifest, [*records_in(RunInfo)]))
+    return replaced(
+        text, "summary.json", record_tables(Summary, [*records_in(RunInfo), *records_in(Manifest)])
+    )
 
 
 def written() -> dict[Path, str]:

@@ -20,9 +20,10 @@ from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, MetricInfo, MetricSeries
 from evaluators.alpasim.settings import SceneScoreSettings
+from evaluators.metrics import MetricValue
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.score import series
-from evaluators.statistics.reduce import Reduction, RolloutValue, reduce_rollout
+from evaluators.statistics.reduce import Reduction, reduce_rollout
 
 WITHOUT_MAP = "the map was missing, or had no road edge where one was needed"
 
@@ -99,7 +100,7 @@ def _reduce(
         del values["offroad"]
     for name, metric in names.items():
         if name not in own:
-            facts = values.get(name) or RolloutValue(None, False, "", metric.unit, metric.direction)
+            facts = values.get(name) or MetricValue(None, False, "", metric.unit, metric.direction)
             values[name] = replace(
                 facts,
                 value=None,

@@ -2,6 +2,7 @@
 ways of measuring it.
 """
 
+from alpasim_plugin.log.run_folder.records import MetricValue
 from evaluators.metrics.table import (
     METRICS,
     MIN_ADE,
@@ -11,4 +12,12 @@ from evaluators.metrics.table import (
     table_of,
 )
 
-__all__ = ["METRICS", "MIN_ADE", "STEP_SERIES", "MetricInfo", "MetricTable", "table_of"]
+__all__ = [
+    "METRICS",
+    "MIN_ADE",
+    "STEP_SERIES",
+    "MetricInfo",
+    "MetricTable",
+    "MetricValue",
+    "table_of",
+]

@@ -7,11 +7,11 @@ At fault is front or lateral, or what nuPlan calls so. By the paper's protocol o
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.log.run_folder.records import Contact
 from evaluators.metrics import nuplan
 from evaluators.metrics.contact import (
     FRONT,
@@ -42,17 +42,17 @@ class ContactEvent:
     x_m: float  # where on the footprint: rig frame, forward of the rear axle
     y_m: float  # rig frame, left
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields by name, for a manifest; micrometres and tenths of microseconds are
-        rounded away.
+    def rounded(self) -> Contact:
+        """Return the contact for a manifest; micrometres and tenths of microseconds are rounded
+        away.
         """
-        return {
-            "actor_id": self.actor_id,
-            "t_s": round(self.t_s, 6),
-            "side": self.side,
-            "x_m": round(self.x_m, 5),
-            "y_m": round(self.y_m, 5),
-        }
+        return Contact(
+            actor_id=self.actor_id,
+            t_s=round(self.t_s, 6),
+            side=self.side,
+            x_m=round(self.x_m, 5),
+            y_m=round(self.y_m, 5),
+        )
 
 
 def contact_events(

@@ -16,9 +16,9 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, speeds
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.path_end import ends_with_path
 from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.log.run_folder.records import DriveEvent
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.motion import time_to_collision_s
 from evaluators.metrics.presets import Preset
@@ -115,20 +115,19 @@ def in_words(had: Iterable[str]) -> str:
     return " and ".join(outcome.words for outcome in told(had)) or NO_OUTCOME
 
 
-def first_failure(manifest: JsonView) -> JsonView | None:
-    """Return the event of a manifest with which its drive failed first, a contact at any side among
+def first_failure(events: Iterable[DriveEvent]) -> DriveEvent | None:
+    """Return the event of a rollout with which its drive failed first, a contact at any side among
     them; None where it did not.
 
     Example:
-        >>> first_failure({"events": [{"metric": "offroad", "t_us": 9}, {"metric": "collision_front", "t_us": 5}]})["t_us"]
-        5
+        >>> events = [DriveEvent("offroad", 9, 0.9, 0.0, 0.0), DriveEvent("collision_front", 5, 0.5, 0.0, 0.0)]
+        >>> first_failure(events).metric
+        'collision_front'
     """
-    failures = (
-        event
-        for event in manifest.get("events") or ()
-        if event["metric"] in OUTCOMES or event["metric"] in CONTACT_SIDES
-    )
-    return min(failures, key=lambda event: int(event["t_us"]), default=None)
+    failures = [
+        event for event in events if event.metric in OUTCOMES or event.metric in CONTACT_SIDES
+    ]
+    return min(failures, key=lambda event: event.t_us, default=None)
 
 
 def event_words(metric: str) -> str:

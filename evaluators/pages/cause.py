@@ -148,8 +148,8 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     """
     log = _log_so_far(run, rollout)
     manifest = run.manifest(rollout)
-    first = first_failure(manifest)
-    failed_us = None if first is None else int(first["t_us"])
+    first = None if manifest is None else first_failure(manifest.events)
+    failed_us = None if first is None else first.t_us
     start_us = 0 if log is None else log.render_start_us
     if log is not None and not rollout.ok:
         failed_us = int(log.ego.t_us[-1])
@@ -172,8 +172,8 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
             sentences.append(f"{CHECK}{text}.")
     if log is not None and rollout.ok:
         ended_us = int(log.ego.t_us[-1]) if outcome == SHORT_OF_END else failed_us
-        contacts = manifest.get("contacts") or ()
-        met = str(contacts[0]["actor_id"]) if contacts else ""
+        contacts = () if manifest is None else manifest.contacts
+        met = contacts[0].actor_id if contacts else ""
         if ended_us is not None:
             sentences += plan_facts(log, ended_us, outcomes, met)
     sentences += [

@@ -241,14 +241,19 @@ def read_logs(run: Run, cell: WatchedCell) -> Logs:
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
     path = run.file_of(rollout, LOG_NAME)
     if path is None:
-        stated = run.manifest(rollout).get(
-            "log"
-        )  # as it was named to simrun score, so from the same working directory
-        path = None if stated is None else Path(str(stated))
+        # As it was named to simrun score, so from the same working directory.
+        stated = _scored_log(run, rollout)
+        path = None if stated is None else Path(stated)
     try:
         return read_log(path) if path is not None and os.path.isfile(path) else None
     except SimrunError as error:
         return error  # the page says so in this rollout's place; the others are still shown
+
+
+def _scored_log(run: Run, rollout: Rollout) -> str | None:
+    """Return the path of the log that a rollout was scored from; None where it was driven."""
+    manifest = run.manifest(rollout)
+    return None if manifest is None else manifest.log
 
 
 def read_log(path: Path) -> RolloutLog:
@@ -288,7 +293,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
             why = (
                 log.message
                 if log is not None
-                else f"{run.manifest(rollout).get('log') or LOG_NAME} is missing"
+                else f"{_scored_log(run, rollout) or LOG_NAME} is missing"
             )
             drives.append(name | {"failed": f"its log cannot be read: {why}"})
         else:

@@ -15,6 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.log.run_folder.records import Contact
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
 from evaluators.pages.birdseye import chord_angle, drawn_map
 from evaluators.pages.images import Rows, seen_before
@@ -160,6 +161,8 @@ def drive_data(
         frames: Facts of its camera frames.
     """
     steps = run.steps_of(rollout)
+    manifest = run.manifest(rollout)
+    contacts = () if manifest is None else manifest.contacts
     return {
         "ego": place.track(log.ego),
         "size": [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)],
@@ -170,7 +173,7 @@ def drive_data(
             for plan in log.plans
         ],
         "curves": curves(steps, place),
-        "moments": moments(rollout, steps, run.manifest(rollout), place, frames),
+        "moments": moments(rollout, steps, contacts, place, frames),
     }
 
 
@@ -223,7 +226,7 @@ def curves(steps: pa.Table, place: Place) -> JsonObject:
 
 
 def moments(
-    rollout: Rollout, steps: pa.Table, manifest: JsonView, place: Place, frames: Rows
+    rollout: Rollout, steps: pa.Table, contacts: Sequence[Contact], place: Place, frames: Rows
 ) -> list[JsonObject]:
     """List what happened when: counted collisions and departures from the road, and frames that a
     guard replaced or named.
@@ -236,9 +239,9 @@ def moments(
         if event.t_us is not None and event.t_s is not None:
             t_ms = place.ms([event.t_us])[0]
             if event.kind == "collision":
-                for contact in manifest.get("contacts") or ():
-                    if abs(float(contact["t_s"]) - event.t_s) <= CONTACT_TOLERANCE_S:
-                        text += f" with {contact['actor_id']}"
+                for contact in contacts:
+                    if abs(contact.t_s - event.t_s) <= CONTACT_TOLERANCE_S:
+                        text += f" with {contact.actor_id}"
                         break
             text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
         found.append({"t": t_ms, "kind": event.kind, "text": text})

@@ -61,8 +61,9 @@ def worst_change(run: Run) -> list[Shot]:
     log = None if worst is None else _log_of(run, worst)
     if worst is None or log is None:
         return []
-    failure = first_failure(run.manifest(worst))
-    t_us = int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure["t_us"])
+    manifest = run.manifest(worst)
+    failure = None if manifest is None else first_failure(manifest.events)
+    t_us = int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure.t_us)
     chosen = {worst.cell, *(() if flip is None else (flip.base.cell,))}
     beside = [
         one

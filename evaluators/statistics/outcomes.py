@@ -5,9 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonView
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import KEYS
 from evaluators.metrics.outcomes import (
     CONTACT_SIDES,
     ENDINGS,
@@ -27,16 +26,15 @@ LISTED = 20  # rollouts named per outcome in summary.json
 DISTANCE = "lateral_distance_m"
 
 
-def times_of(manifests: Iterable[JsonView]) -> Times:
+def times_of(manifests: Iterable[Manifest]) -> Times:
     """Return when the outcomes of manifests began."""
     times: dict[tuple[str, str, str, int], Mapping[str, float]] = {}
     for manifest in manifests:
-        began = {event["metric"]: float(event["t_s"]) for event in manifest.get("events") or ()}
+        began = {event.metric: event.t_s for event in manifest.events}
         contact = [began[side] for side in CONTACT_SIDES if side in began]
         if contact:
             began |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
-        renderer, policy, scene, seed = (manifest[key] for key in KEYS)
-        times.setdefault((renderer, policy, scene, seed), began)
+        times.setdefault(manifest.cell, began)
     return times
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.core.types import F64, I64, Aggregation, Direction, MetricInfo, MetricSeries
+from alpasim_plugin.core.types import F64, I64, Aggregation, MetricInfo, MetricSeries
+from alpasim_plugin.log.run_folder.records import Ledger, MetricValue
 from evaluators.metrics import METRICS
 from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
@@ -38,48 +39,10 @@ BLACK = "dropped: a camera image is black in the scored part"
 
 
 @dataclass(frozen=True)
-class RolloutValue:
-    """One metric of one rollout; ``value`` is None where not valid, and ``reason`` then says
-    why.
-    """
-
-    value: float | None
-    valid: bool
-    reason: str
-    unit: str
-    direction: Direction
-
-    def as_dict(self) -> JsonObject:
-        """Return the fields for a manifest; an infinite value, for which JSON has no number, is the
-        text "inf" or "-inf".
-        """
-        infinite = self.value is not None and np.isinf(self.value)
-        return self.__dict__ | ({"value": str(self.value)} if infinite else {})
-
-
-@dataclass(frozen=True)
-class Ledger:
-    """What the rules removed from one rollout, in steps of the ego's time line."""
-
-    steps_total: int
-    steps_warmup: int  # before the policy took over
-    steps_after_event: int  # after the first off-road or collision event
-    steps_after_drift: (
-        int  # after the first step beyond the preset's distance from the recorded path
-    )
-    steps_scored: int
-    dropped: str  # why the whole rollout does not count, or ""
-
-    def as_dict(self) -> JsonObject:
-        """Return the counts by name, for a manifest."""
-        return dict(self.__dict__)
-
-
-@dataclass(frozen=True)
 class Reduction:
     """Everything that the reduction of one rollout gives."""
 
-    values: dict[str, RolloutValue]
+    values: dict[str, MetricValue]
     ledger: Ledger
     events: tuple[
         JsonObject, ...
@@ -92,14 +55,10 @@ class Reduction:
             row[name], row[f"{name}_valid"] = value.value, value.valid
         return row
 
-    def as_dict(self) -> dict[str, JsonObject]:
-        """Return METRIC -> value, valid, reason, unit, direction, for a manifest."""
-        return {name: value.as_dict() for name, value in self.values.items()}
-
 
 def rollout_values(
     series: Sequence[MetricSeries], preset: str | Preset = DEFAULT
-) -> dict[str, RolloutValue]:
+) -> dict[str, MetricValue]:
     """Return one value per metric of a rollout, after dropping the steps that do not count.
 
     Args:
@@ -214,7 +173,7 @@ def _first_time(metric_series: MetricSeries, first_us: int) -> int | None:
 
 def _reduce(
     metric_series: MetricSeries, first_us: int, last_us: int, preset: Preset, dropped: str
-) -> RolloutValue:
+) -> MetricValue:
     if dropped:
         return _value(metric_series.metric, None, dropped)
     rows = (metric_series.t_us >= first_us) & (metric_series.t_us <= last_us)
@@ -261,5 +220,5 @@ _REDUCE: dict[Aggregation, Callable[[F64, I64], float]] = {
 }
 
 
-def _value(metric: MetricInfo, value: float | None, reason: str = "") -> RolloutValue:
-    return RolloutValue(value, value is not None, reason, metric.unit, metric.direction)
+def _value(metric: MetricInfo, value: float | None, reason: str = "") -> MetricValue:
+    return MetricValue(value, value is not None, reason, metric.unit, metric.direction)

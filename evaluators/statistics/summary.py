@@ -9,17 +9,16 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import F64
+from alpasim_plugin.log.run_folder.records import Ledger, Manifest
 from alpasim_plugin.log.run_folder.schema import cell_name
 from alpasim_plugin.log.run_folder.sides import (
     RolloutTable,
+    RolloutValues,
     Row,
     Side,
     by_renderer,
-    failure_of,
     metric_names,
-    reason_of,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.results import (
@@ -126,63 +125,74 @@ COUNTS = (  # of `Censoring`, which add up over runs
     "frames",
     "frames_passed_raw",
 )
+# Of a rollout that was not scored.
+NOTHING_SCORED = Ledger(0, 0, 0, 0, 0, "")
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
-def censoring(rows: Sequence[Row], known: MetricTable = METRICS) -> dict[str, Censoring]:
+def censoring(manifests: Sequence[Manifest], known: MetricTable = METRICS) -> dict[str, Censoring]:
     """Count what did not enter the table, per renderer and cause.
 
     Args:
-        rows: Rollout rows or manifests as for `aggregate`, with ``censored`` (a `Ledger` as dict),
-            ``frames`` and ``frame_events`` where a rollout was scored, and ``failure_class`` or
-            ``error`` where it failed.
+        manifests: Of all rollouts.
         known: What the metrics are.
 
     Returns:
         RENDERER -> what was removed, and the bounds of rates that this allows.
     """
-    names = metric_names(rows)
-    return {name: _of_renderer(side, names, known) for name, side in by_renderer(rows).items()}
+    names = list(dict.fromkeys(name for manifest in manifests for name in manifest.metrics))
+    by_name: dict[str, list[Manifest]] = {}
+    for manifest in manifests:
+        by_name.setdefault(manifest.renderer, []).append(manifest)
+    return {
+        renderer: _of_renderer(of_renderer, names, known)
+        for renderer, of_renderer in by_name.items()
+    }
 
 
-def _of_renderer(side: Side, names: Sequence[str], known: MetricTable) -> Censoring:
-    done = [row for row, ok in zip(side.rows, side.ok, strict=True) if ok]
-    lost = [row for row, ok in zip(side.rows, side.ok, strict=True) if not ok]
-    ledgers = [row["censored"] for row in done if row.get("censored")]
+def _of_renderer(
+    manifests: Sequence[Manifest], names: Sequence[str], known: MetricTable
+) -> Censoring:
+    side = Side.of([RolloutValues.of_manifest(manifest) for manifest in manifests])
+    finished = [manifest for manifest in manifests if manifest.ok]
+    ledgers = [manifest.censored for manifest in finished if manifest.censored is not None]
     events: Counter[str] = Counter()
-    for row in done:
-        events.update(row.get("frame_events") or {})
-
-    def steps(rule: str) -> int:
-        return sum(int(ledger[rule]) for ledger in ledgers)
-
-    invalid: dict[str, InvalidValues] = {}
-    for name in names:
-        absent = np.flatnonzero(side.ok & ~np.isfinite(side.raw(name)))
-        if len(absent):
-            reasons = Counter(reason_of(side.rows[i], name) for i in absent)
-            invalid[name] = InvalidValues(len(absent), dict(reasons))
+    for manifest in finished:
+        events.update(manifest.frame_events)
     rates = {
-        name: _rate_limits(side, known.info(name)) for name in names if known.info(name).is_flag
+        name: _rate_limits(manifests, side, known.info(name))
+        for name in names
+        if known.info(name).is_flag
     }
     return Censoring(
-        rollouts=len(side.rows),
-        failed=dict(Counter(map(failure_of, lost))),
-        dropped=dict(Counter(ledger["dropped"] for ledger in ledgers if ledger["dropped"])),
-        steps_total=steps("steps_total"),
-        steps_warmup=steps("steps_warmup"),
-        steps_after_event=steps("steps_after_event"),
-        steps_after_drift=steps("steps_after_drift"),
-        steps_scored=steps("steps_scored"),
-        frames=sum(int(row.get("frames") or 0) for row in done),
+        rollouts=len(manifests),
+        failed=dict(Counter(manifest.failure_class for manifest in manifests if not manifest.ok)),
+        dropped=dict(Counter(ledger.dropped for ledger in ledgers if ledger.dropped)),
+        steps_total=sum(ledger.steps_total for ledger in ledgers),
+        steps_warmup=sum(ledger.steps_warmup for ledger in ledgers),
+        steps_after_event=sum(ledger.steps_after_event for ledger in ledgers),
+        steps_after_drift=sum(ledger.steps_after_drift for ledger in ledgers),
+        steps_scored=sum(ledger.steps_scored for ledger in ledgers),
+        frames=sum(manifest.frames or 0 for manifest in finished),
         frame_events=dict(events),
         frames_passed_raw=sum(n for event, n in events.items() if event.startswith(FIXER_GUARD)),
-        invalid=invalid,
+        invalid=_invalid_values(side, names),
         bounds={name: limits.bounds for name, limits in rates.items()},
         bounds_rollouts={name: limits.bounds_rollouts for name, limits in rates.items()},
         bounds_rollouts_ci95={name: limits.bounds_rollouts_ci95 for name, limits in rates.items()},
         cut={name: limits.n_cut for name, limits in rates.items()},
     )
+
+
+def _invalid_values(side: Side, names: Sequence[str]) -> dict[str, InvalidValues]:
+    """Count the finished rollouts without a valid value of a metric, by reason."""
+    invalid: dict[str, InvalidValues] = {}
+    for name in names:
+        absent = np.flatnonzero(side.ok & ~np.isfinite(side.raw(name))).tolist()
+        if absent:
+            reasons = Counter(side.reason(rollout, name) for rollout in absent)
+            invalid[name] = InvalidValues(len(absent), dict(reasons))
+    return invalid
 
 
 class RateLimits(NamedTuple):
@@ -194,13 +204,14 @@ class RateLimits(NamedTuple):
     n_cut: int
 
 
-def _rate_limits(side: Side, metric: MetricInfo) -> RateLimits:
+def _rate_limits(manifests: Sequence[Manifest], side: Side, metric: MetricInfo) -> RateLimits:
     values = side.raw(metric.name)
-    ledgers = [row.get("censored") for row in side.rows]
-    cut = np.array([_steps_cut(ledger) for ledger in ledgers], np.float64)
-    scored = np.array(
-        [int(ledger["steps_scored"]) if ledger else 0 for ledger in ledgers], np.float64
+    ledgers = [manifest.censored or NOTHING_SCORED for manifest in manifests]
+    cut = np.array(
+        [ledger.steps_after_event + ledger.steps_after_drift for ledger in ledgers],
+        dtype=np.float64,
     )
+    scored = np.array([ledger.steps_scored for ledger in ledgers], dtype=np.float64)
     over_rollouts, over_steps, n_cut = rate_bounds(
         values, cut, scored, is_share=metric.aggregation == "mean"
     )
@@ -210,10 +221,6 @@ def _rate_limits(side: Side, metric: MetricInfo) -> RateLimits:
         for fill in (0.0, 1.0)
     )
     return RateLimits(over_steps, over_rollouts, (none.low, every.high), n_cut)
-
-
-def _steps_cut(ledger: JsonView | None) -> int:
-    return sum(int(ledger[rule]) for rule in CUT_RULES) if ledger else 0
 
 
 def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[Bounds, Bounds, int]:

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.log.run_folder.checksums import state_files
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO, STEPS_NAME, TABLES
-from tests.run_records import run_info
+from tests.run_records import manifest, run_info
 
 KEYS = ["renderer", "policy", "scene", "seed", "status", "path"]
 
@@ -24,6 +24,6 @@ def vouch_for(root):
         held = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).exists() else {}
         folder.mkdir(parents=True, exist_ok=True)
         (folder / STEPS_NAME).touch()
-        write_manifest(folder, row | held)
+        write_manifest(folder, manifest(row | held))
     state_files(root, [RUN_INFO, *TABLES])
     return root

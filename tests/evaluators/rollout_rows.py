@@ -1,4 +1,6 @@
-"""Rows of rollouts with chosen values."""
+"""Rows and manifests of rollouts with chosen values."""
+
+from tests.run_records import manifest
 
 
 def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
@@ -17,4 +19,24 @@ def rows_of(values, metric="route_distance_m", renderer="3dgs", status="ok"):
         }
         for i, scene in enumerate(values)
         for k, value in enumerate(scene)
+    ]
+
+
+def manifests_of(values, metric="route_distance_m", **members):
+    """Manifests of the rollouts of `rows_of`."""
+    return [
+        manifest(
+            {key: row[key] for key in ("renderer", "policy", "scene", "seed", "status")}
+            | {
+                "metrics": {
+                    metric: {
+                        "value": row[metric],
+                        "valid": row[f"{metric}_valid"],
+                        "reason": "" if row[f"{metric}_valid"] else "not given",
+                    }
+                }
+            }
+            | members
+        )
+        for row in rows_of(values, metric)
     ]

@@ -21,6 +21,7 @@ from evaluators.metrics.outcomes import (
 from evaluators.metrics.presets import PRESETS
 from evaluators.metrics.table import METRICS
 from evaluators.statistics.outcomes import outcome_table, times_of
+from tests import run_records
 
 DT_S = 0.1
 V = 8.0
@@ -196,7 +197,8 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
         "metrics": {},
         "error": {"failure_class": "renderer", "message": "no"},
     }
-    manifests = [manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost]
+    rollouts = [manifest("a", "one"), manifest("b", "one", offroad=1.0), broken, lost]
+    manifests = [run_records.manifest(members) for members in rollouts]
     table = outcome_table(rollouts_of_table(rollout_table(manifests)), times_of(manifests))
     assert table["clean/a"].endings == {"reached the end": 1}
     assert table["clean/b"].endings == {"off-road": 1, "policy fault": 1, "not run": 1}

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 from scipy import stats
 
+from alpasim_plugin.log.run_folder.records import RolloutError
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators import aggregate, censoring, paired
 from evaluators.metrics import METRICS
@@ -20,7 +21,7 @@ from evaluators.statistics.intervals import (
     normal_half_width,
 )
 from evaluators.statistics.summary import numbers
-from tests.evaluators.rollout_rows import rows_of
+from tests.evaluators.rollout_rows import manifests_of, rows_of
 
 
 def entry(values, metric="route_distance_m"):
@@ -220,17 +221,12 @@ def test_the_ledger_counts_every_cause_and_bounds_every_rate():
         "steps_scored": 5,
         "dropped": "",
     }
-    rows = [{**row, "censored": ledger} for row in rows_of([[1.0, 0.0], [None, 0.0]], "offroad")]
-    rows += [
-        {
-            **rows[0],
-            "scene": "scene-9",
-            "status": "failed",
-            "failure_class": "policy",
-            "censored": None,
-        }
-    ]
-    found = censoring(rows)["3dgs"]
+    manifests = manifests_of([[1.0, 0.0], [None, 0.0]], "offroad", censored=ledger)
+    error = RolloutError("no plan", "correct it", "policy")
+    manifests.append(
+        replace(manifests[0], scene="scene-9", status="failed", error=error, censored=None)
+    )
+    found = censoring(manifests)["3dgs"]
     assert found.rollouts == 5
     assert found.failed == {"policy": 1}
     assert (
@@ -255,10 +251,10 @@ def test_bounds_with_sampling_error_hold_the_rate_where_crashes_hide_events():
     for _ in range(100):
         had = (rng.random(40) < 0.2).astype(float)
         gone = (had > 0) & (rng.random(40) < 0.5)
-        rows = rows_of(
+        manifests = manifests_of(
             [[None if lost else value] for lost, value in zip(gone, had, strict=True)], "offroad"
         )
-        low, high = censoring(rows)["3dgs"].bounds_rollouts_ci95["offroad"]
+        low, high = censoring(manifests)["3dgs"].bounds_rollouts_ci95["offroad"]
         held += low <= 0.2 <= high
     assert held >= 93
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from alpasim_plugin.log.run_folder.sides import Side
+from alpasim_plugin.log.run_folder.sides import by_renderer
 from evaluators import METRICS, paired
 from evaluators.results import CellCounts, SceneCounts
 from evaluators.statistics.paired import compare
@@ -13,8 +13,8 @@ from tests.evaluators.rollout_rows import rows_of
 
 
 def pair(base, other, metric="route_distance_m", margin=None):
-    side = Side.of(rows_of(other, metric))
-    base_side = Side.of(rows_of(base, metric))
+    side = by_renderer(rows_of(other, metric))["3dgs"]
+    base_side = by_renderer(rows_of(base, metric))["3dgs"]
     return compare(side, base_side, METRICS.info(metric), "clean", margin)
 
 

@@ -17,6 +17,7 @@ from alpasim_plugin.log.run_folder.writer import write_steps
 from alpasim_plugin.runs.summary import write_summary
 from evaluators.pages.flips import find_flips
 from evaluators.statistics.opening import read_run
+from tests import run_records
 from tests.run_records import run_info
 
 METRICS = (
@@ -326,14 +327,15 @@ def _rollout(renderer, policy, scene, seed, content, wander, plan, rng):  # type
 
 def _written(folder, manifest, steps, plan):
     """Write a rollout's folder as the runtime does, and return its manifest."""
-    place = folder / manifest["path"]
+    record = run_records.manifest(manifest)
+    place = folder / record.path
     place.mkdir(parents=True, exist_ok=True)
-    if manifest["status"] == "ok":
+    if record.ok:
         write_steps(place, steps)
-        if plan.clips and manifest["seed"] == plan.seeds[0]:
+        if plan.clips and record.seed == plan.seeds[0]:
             (place / "front.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42")
-    write_manifest(place, manifest)
-    return manifest
+    write_manifest(place, record)
+    return record
 
 
 def _picture(renderer, k, width, height):
@@ -357,9 +359,9 @@ def _run_json(plan, maps, manifests):
         "pool": {
             "workers": 2,
             "threads_per_worker": 1,
-            "frames": sum(manifest["frames"] for manifest in manifests),
+            "frames": sum(manifest.frames for manifest in manifests),
             "frames_per_s_total": 41.2,
-            "wall_s": sum(manifest["wall_s"] for manifest in manifests) / 2,
+            "wall_s": sum(manifest.wall_s for manifest in manifests) / 2,
         },
         "schema_version": 1,
         "command": [

@@ -16,6 +16,7 @@ from alpasim_plugin.core.types import Actor, Box, CameraSpec, EgoState, Frame, T
 from alpasim_plugin.log import AslWriter, RolloutHeader, write_facts
 from alpasim_plugin.log.run_folder.manifests import write_manifest, write_run_json
 from evaluators.statistics.opening import read_run
+from tests import run_records
 from tests.pages.make_run import DT_US, Plan, make_run
 from tests.run_records import run_info
 
@@ -170,7 +171,7 @@ def write_manifests(folder):
             name: {"value": value, "valid": value is not None, "reason": "", "unit": ""}
             for name, value in rollout.metrics.items()
         }
-        error = {"failure_class": rollout.failure_class, "found": rollout.failure}
+        error = {"failure_class": rollout.failure_class, "message": rollout.failure}
         manifest = {
             key: getattr(rollout, key)
             for key in ("renderer", "policy", "scene", "seed", "path", "status", "frames", "steps")
@@ -178,7 +179,7 @@ def write_manifests(folder):
         manifest |= {"wall_s": 1.0, "metrics": metrics, "contacts": []} | (
             {} if rollout.ok else {"error": error}
         )
-        write_manifest(place, manifest)
+        write_manifest(place, run_records.manifest(manifest))
 
 
 def unfinished(folder, without):

@@ -4,7 +4,6 @@ gate.md.
 
 import base64
 import dataclasses
-import json
 import re
 from types import SimpleNamespace
 
@@ -14,6 +13,7 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.log import encode_image
+from alpasim_plugin.log.run_folder.manifests import write_manifest
 from evaluators.metrics import METRICS
 from evaluators.pages import worst
 from evaluators.pages.ci import write_summary_md
@@ -24,6 +24,7 @@ from evaluators.results import Difference, Endings
 from evaluators.statistics.numbers import DASH
 from evaluators.statistics.opening import read_run
 from tests.pages.make_run import Plan, make_run
+from tests.run_records import manifest
 
 PRIMARY = METRICS.primary
 
@@ -214,8 +215,9 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
     )
     for one in rollouts:
         (run.folder / one.path / "rollout.asl").touch()
-        manifest = {"events": [{"metric": "collision_front", "t_us": 3_300_000}]}
-        (run.folder / one.path / "manifest.json").write_text(json.dumps(manifest))
+        events = [{"metric": "collision_front", "t_us": 3_300_000}]
+        members = {"events": events, "path": one.path, "status": "failed"}
+        write_manifest(run.folder / one.path, manifest(members))
     images = [
         SimpleNamespace(camera=camera, end_us=1_000_000 * k, data=grey(level * k))
         for k in range(6)

@@ -3,6 +3,7 @@
 import ast
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from alpasim_plugin.log.run_folder.manifests import (
     write_manifest,
     write_run_json,
 )
+from alpasim_plugin.log.run_folder.records import MetricValue
 from alpasim_plugin.log.run_folder.schema import RUN_INFO, TABLES
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.summary import write_summary
@@ -49,7 +51,8 @@ def two_changes(tmp_path_factory):
         folder = root / rollout.path
         manifest = read_manifest(folder)
         value = 0.0 if rollout.renderer == "clean" else 1.0
-        manifest["metrics"][PRIMARY] = {"value": value, "valid": True, "reason": ""}
+        metrics = manifest.metrics | {PRIMARY: MetricValue(value, True, "", "", "lower")}
+        manifest = replace(manifest, metrics=metrics)
         write_manifest(folder, manifest)
         manifests.append(manifest)
     info = read_run_json(root)

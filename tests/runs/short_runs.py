@@ -21,7 +21,7 @@ class Announced:
         self.threads = threads
 
     def rollout_done(self, manifest, reused):
-        self.results.append((manifest["status"], reused))
+        self.results.append((manifest.status, reused))
 
     def noticed(self, text):
         self.notices.append(text)

@@ -43,8 +43,8 @@ def test_a_driver_that_follows_the_route_and_sees_nothing_collides(suite):
     recorder = run_rollout(
         scenario, make_renderer(GREY, scenario), make_policy("pure-pursuit", scenario), seed=0
     )
-    values = reduce_rollout(score(recorder.log(), scenario.scene), "paper").as_dict()
-    assert values["collision_at_fault"]["value"] == 1.0
+    values = reduce_rollout(score(recorder.log(), scenario.scene), "paper").values
+    assert values["collision_at_fault"].value == 1.0
 
 
 def test_every_shipped_suite_is_listed():

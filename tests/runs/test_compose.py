@@ -13,7 +13,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.parts import resolve, resolve_renderer, spec
 from alpasim_plugin.fixers.settings import FixerSettings
+from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.provenance import part_facts
 from scenarios.suite import expand
 
 
@@ -153,7 +155,7 @@ def test_weights_enter_the_key_by_their_content_and_not_by_their_time(tmp_path):
     assert keys(("onefixer-dit-tiny",), (f"weights.dit={path}",)) != first
     fixer = resolve("fixer", "onefixer-dit-tiny", (f"weights.dit={path}",))
     assert dict(fixer.files) == {str(path): file_sha256(path)}
-    json.dumps(fixer.as_dict())
+    json.dumps(json_of(part_facts(fixer)))
 
 
 def test_settings_for_a_fixer_that_is_not_there_are_refused():

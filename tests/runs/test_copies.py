@@ -1,6 +1,7 @@
 """What is driven and rendered once: rollouts without a camera, and the past of a fork."""
 
 import shutil
+from dataclasses import fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -67,7 +68,7 @@ def drive(plan, root, workers=1):
 def origins(root):
     """Return the renderer and scene of each rollout with the rollout that it was copied from."""
     manifests = [read_manifest(path.parent) for path in sorted(root.rglob("manifest.json"))]
-    return {f"{m['renderer'][-6:]} {m['scene']}": m.get("copied_from") for m in manifests}
+    return {f"{m.renderer[-6:]} {m.scene}": m.copied_from for m in manifests}
 
 
 def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
@@ -82,9 +83,13 @@ def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
         original = next(
             one for one in plan.cells if (one.scene, one.seed) == (cell.scene, cell.seed)
         )
-        assert copied["copied_from"] == original.folder.as_posix()
-        differing = {key for key in driven if copied.get(key) != driven[key]}
-        assert differing <= {"wall_s", "stage_ms", "files", "sha256"}
+        assert copied.copied_from == original.folder.as_posix()
+        differing = {
+            member.name
+            for member in fields(driven)
+            if getattr(copied, member.name) != getattr(driven, member.name)
+        }
+        assert differing <= {"wall_s", "stage_ms", "files", "copied_from"}
         for name in ("rollout.asl", "frames.jsonl", "steps.parquet"):
             one, other = (tmp_path / where / cell.folder / name for where in ("run", "alone"))
             assert one.read_bytes() == other.read_bytes()

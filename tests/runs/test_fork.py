@@ -111,7 +111,7 @@ def test_the_run_folder_pairs_the_continuation_with_the_original(past, changed):
 
 
 def test_a_replay_that_leaves_the_log_names_component_and_step(past, tmp_path):
-    copy = tmp_path / "copy" / str(past.manifest["path"])
+    copy = tmp_path / "copy" / past.manifest.path
     copy.mkdir(parents=True)
     for file in past.folder.iterdir():
         (copy / file.name).write_bytes(file.read_bytes())
@@ -135,7 +135,7 @@ def test_instants_outside_and_folders_in_use_are_refused(past, root, tmp_path):
 
 
 def test_rollouts_are_found_by_name_or_folder_and_near_names_are_offered(root, past):
-    assert find_rollout(root, str(past.manifest["path"])).cell == past.cell
+    assert find_rollout(root, past.manifest.path).cell == past.cell
     with pytest.raises(InputError, match="no such rollout among its 2") as caught:
         find_rollout(root, "claen/lane-camera/smoke-lead_car/0")
     assert CELL in caught.value.hint

@@ -36,6 +36,7 @@ from scenarios.suite import ScenarioRef
 from tests.drives.splat_model import poses_of, street_cloud
 from tests.drives.street import RIG_FROM_CAMERA, edited
 from tests.gaussians.sog_writer import write_sog
+from tests.run_records import manifest
 
 SCENE = """version: 1
 road: {segments: [{kind: straight, length_m: 200}]}
@@ -331,8 +332,8 @@ def test_images_of_other_renderers_are_those_of_their_log_and_renderers(scene, m
     def key(*renderers, log="one"):
         refs = [ScenarioRef(str(scene / "scene.yaml"))]
         plan = make_plan(refs, renderers, ("constant-velocity",), (0,), RunOptions())
-        manifest = {"files": {LOG_NAME: {"sha256": log}}}
-        return images_key(plan, plan.cells[0], manifest, ())
+        files = {LOG_NAME: {"bytes": 1, "mtime_ns": 1, "sha256": log}}
+        return images_key(plan, plan.cells[0], manifest({"files": files}), ())
 
     keys = [
         key("clean", "grey.py:Grey"),

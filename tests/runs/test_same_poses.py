@@ -1,6 +1,7 @@
 """A run with several renderers keeps what each of them shows before a failure."""
 
 from alpasim_plugin.core.files import read_json
+from alpasim_plugin.log.run_folder.manifests import read_manifest
 from alpasim_plugin.log.run_folder.schema import SAME_POSES
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.run import execute_run
@@ -20,11 +21,11 @@ def test_images_of_the_other_renderer_are_stored_beside_a_failure(tmp_path):
     root = tmp_path / "run"
     announced = Announced()
     execute_run(plan, root, 1, ["simrun"], announced, report=False)
-    manifests = [read_json(root / cell.folder / "manifest.json") for cell in plan.cells]
-    errors = [manifest.get("error") for manifest in manifests]
+    manifests = [read_manifest(root / cell.folder) for cell in plan.cells]
+    errors = [manifest.error for manifest in manifests]
     assert errors == [None, None], announced.notices
-    is_failure = [first_failure(manifest) is not None for manifest in manifests]
-    assert is_failure == [False, True], [manifest["events"] for manifest in manifests]
+    is_failure = [first_failure(manifest.events) is not None for manifest in manifests]
+    assert is_failure == [False, True], [manifest.events for manifest in manifests]
     (file,) = root.glob(f"rollouts/**/{SAME_POSES}")
     assert file.parent == root / plan.cells[1].folder
     content = read_json(file)

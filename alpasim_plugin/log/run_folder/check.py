@@ -5,13 +5,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import inside
 from alpasim_plugin.log.run_folder.checksums import problem_of, stated_files
 from alpasim_plugin.log.run_folder.manifests import Damage, inspect_rollout, read_run_json
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.log.run_folder.schema import (
     FILES,
     ROLLOUTS_FOLDER,
@@ -34,7 +33,7 @@ class Inspection:
     """
 
     cells: tuple[str, ...]
-    manifests: tuple[dict[str, Any], ...]
+    manifests: tuple[Manifest, ...]
     damage: tuple[Damage, ...]
     unfinished: tuple[str, ...]
     tables_only: bool = False

@@ -6,15 +6,14 @@ command.
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parse_json, read_bytes, read_json_as, read_record, real
+from alpasim_plugin.core.files import parse_json, read_bytes, read_record, real
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.files.limits import JSON_BYTES
-from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.checksums import (
     FileFacts,
     check_seal,
@@ -22,7 +21,7 @@ from alpasim_plugin.log.run_folder.checksums import (
     problem_of,
     sealed,
 )
-from alpasim_plugin.log.run_folder.records import RunInfo, json_of
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo, json_of
 from alpasim_plugin.log.run_folder.schema import (
     DERIVED,
     DRIVEN,
@@ -30,7 +29,6 @@ from alpasim_plugin.log.run_folder.schema import (
     RUN_INFO,
     STEPS_NAME,
 )
-from alpasim_plugin.log.run_folder.shapes import ManifestFile
 
 AGAIN = "Give the command of the run again: finished rollouts are kept."
 
@@ -69,7 +67,7 @@ class RolloutState:
         damage: Damaged files.
     """
 
-    manifest: JsonObject | None
+    manifest: Manifest | None
     damage: tuple[Damage, ...] = ()
 
     @property
@@ -80,31 +78,35 @@ class RolloutState:
         return "score" if self.damage else "none"
 
 
-def write_manifest(folder: Path, manifest: JsonView) -> None:
+def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the manifest of a rollout with the digests of its files; a failed rollout has none.
 
     Raises:
         InfrastructureError: The disk refuses.
     """
     files: dict[str, FileFacts] = {}
-    if manifest.get("status") == "ok":
+    if manifest.ok:
         files = checksums_of(folder, [*DRIVEN, *DERIVED])
-    write_json(folder / MANIFEST, sealed({**manifest, "files": files}))
+    write_json(folder / MANIFEST, sealed(json_of(replace(manifest, files=files))))
 
 
-def read_manifest(folder: Path) -> JsonObject:
+def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of a rollout.
 
     Raises:
         InputError: It is missing, damaged, or names a file that no rollout has.
     """
     path = folder / MANIFEST
-    manifest = cast("JsonObject", read_json_as(ManifestFile, path, do_this=AGAIN))
-    check_seal(manifest, path, AGAIN)
-    others = sorted(set(manifest["files"]) - {*DRIVEN, *DERIVED})
+    data = read_bytes(path, JSON_BYTES, AGAIN)
+    content = parse_json(data, path, AGAIN)
+    manifest = read_record(Manifest, data, path, AGAIN)
+    if "files" not in content:
+        raise InputError(f"{path}: files: missing", AGAIN)
+    check_seal(content, path, AGAIN)
+    others = sorted(set(manifest.files) - {*DRIVEN, *DERIVED})
     if others:
         raise InputError(f"{path} names {others[0]!r}, which no rollout has.", AGAIN)
-    if manifest["status"] == "ok" and STEPS_NAME not in manifest["files"]:
+    if manifest.ok and STEPS_NAME not in manifest.files:
         raise InputError(f"{path} does not name {STEPS_NAME}.", AGAIN)
     return manifest
 
@@ -133,9 +135,9 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
     except InputError as error:
         return RolloutState(None, (Damage(cell, MANIFEST, error.message),))
     damage = []
-    if manifest["path"] != cell:
-        damage.append(Damage(cell, MANIFEST, f"of another rollout, {manifest['path']}"))
-    for name, facts in manifest["files"].items():
+    if manifest.path != cell:
+        damage.append(Damage(cell, MANIFEST, f"of another rollout, {manifest.path}"))
+    for name, facts in manifest.files.items():
         problem = problem_of(folder / name, facts, full)
         if problem is not None:
             damage.append(Damage(cell, name, problem))

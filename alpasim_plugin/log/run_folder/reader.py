@@ -28,8 +28,8 @@ from alpasim_plugin.core.files import (
 from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.check import inspect_run
-from alpasim_plugin.log.run_folder.manifests import read_run_json
-from alpasim_plugin.log.run_folder.records import RunInfo
+from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
+from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts_of_table
 from alpasim_plugin.log.run_folder.schema import (
     AGAIN,
@@ -104,7 +104,7 @@ class Run:
         found = inspect_run(root)
         damaged = {one.cell for one in found.damage}
         with parsing(root, AGAIN, "manifests from which no table can be made"):
-            whole = [manifest for manifest in found.manifests if manifest["path"] not in damaged]
+            whole = [manifest for manifest in found.manifests if manifest.path not in damaged]
             table = rollout_table(whole)
         return cls(
             root,
@@ -164,10 +164,14 @@ class Run:
         path = self.scene_path(scene)
         return None if path is None else read_json_as(SceneFile, path, do_this=AGAIN)
 
-    def manifest(self, rollout: Rollout) -> JsonView:
-        """Read a rollout's manifest; empty where the rollout did not get so far."""
+    def manifest(self, rollout: Rollout) -> Manifest | None:
+        """Read a rollout's manifest; None where the rollout did not get so far.
+
+        Raises:
+            InputError: It is damaged.
+        """
         path = self.file_of(rollout, MANIFEST)
-        return {} if path is None else read_json(path)
+        return None if path is None else read_manifest(path.parent)
 
     def file_of(self, rollout: Rollout, name: str) -> Path | None:
         """Find a file in a rollout's folder; None where absent or where the path leaves the run

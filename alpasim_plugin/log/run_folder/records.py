@@ -16,6 +16,8 @@ from pydantic import BeforeValidator
 
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.metric_types import MetricInfo
+from alpasim_plugin.core.types import Direction
+from alpasim_plugin.log.run_folder.checksums import FileFacts
 
 INFINITE = ("inf", "-inf")  # JSON has no number for them
 
@@ -237,6 +239,216 @@ class Fork:
     seed: int | None
     of: str
     replay: Literal["equal"]
+
+
+@dataclass(frozen=True)
+class MetricValue:
+    """One metric of one rollout.
+
+    Attributes:
+        value: None where it is not valid; the text "inf" or "-inf" in the file where it is infinite,
+            for which JSON has no number.
+        valid: There is a value.
+        reason: Why there is none, else empty.
+        unit: Of the metric.
+        direction: The metric's better side.
+    """
+
+    value: Number | None
+    valid: bool
+    reason: str
+    unit: str
+    direction: Direction
+
+
+@dataclass(frozen=True)
+class DriveEvent:
+    """The first time of an outcome among the scored steps of a rollout.
+
+    Attributes:
+        metric: The outcome's flag.
+        t_us: When, microseconds, as in the log.
+        t_s: The same in seconds after the first frame.
+        x_m, y_m: Centre of the ego's box then, metres, world.
+    """
+
+    metric: str
+    t_us: int
+    t_s: float
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A road user that begins to touch the ego.
+
+    Attributes:
+        actor_id: Who.
+        t_s: When, seconds after the log's first ego pose.
+        side: ``front``, ``rear`` or ``lateral``.
+        x_m, y_m: Where on the footprint, metres, rig: forward of the rear axle, and to the left.
+    """
+
+    actor_id: str
+    t_s: float
+    side: str
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """What the rules removed from one rollout, in steps of the ego's time line.
+
+    Attributes:
+        steps_total: Steps driven.
+        steps_warmup: Before the policy took over.
+        steps_after_event: After the first event that ends the scored part.
+        steps_after_drift: After the first step beyond the preset's distance from the recorded path.
+        steps_scored: Those that enter the metrics.
+        dropped: Why the whole rollout does not count, else empty.
+    """
+
+    steps_total: int
+    steps_warmup: int
+    steps_after_event: int
+    steps_after_drift: int
+    steps_scored: int
+    dropped: str
+
+
+@dataclass(frozen=True)
+class RolloutError:
+    """Why a rollout could not be run or scored.
+
+    Attributes:
+        message: What is wrong with which value.
+        hint: What to do.
+        failure_class: Whose fault it is (docs/cli.md).
+    """
+
+    message: str
+    hint: str
+    failure_class: str
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """What AlpaSim's score of a scene says of a rollout.
+
+    Attributes:
+        failure_reason: Why its score is 0; None where it is not.
+    """
+
+    failure_reason: str | None
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """``manifest.json`` of a rollout, which is written last: a rollout without one is unfinished.
+
+    Attributes:
+        renderer, policy, scene, seed: Its key.
+        path: Its folder below the run folder.
+        status: It ran to its end and was scored, or not.
+        wall_s: Seconds that it took; None where it was never driven to its end.
+        files: Name of each file in the folder -> its digest; empty of a failed rollout.
+        rollout_key: Digest of ``made_of``.
+        made_of: Digest by name of everything that decides the log.
+        score_key: Digest of ``rollout_key`` and of everything that decides the scores.
+        preset: Evaluator preset.
+        stops_at_path_end: It was to stop at the end of the path.
+        video: Which rollouts of the run get a film.
+        inputs: Path of each file that was read while it was driven, beside what ``made_of`` holds ->
+            digest.
+        score_inputs: The same, while it was scored.
+        frames: Camera frames.
+        first_call_frames: Those of the first call, which may compile or fill caches.
+        steps: Control steps.
+        frame_events: Kind -> frames in which a guard saw something.
+        passed_path_end: It went beyond the end of the path.
+        ended: By what it ended: ``time``, or the kind of the path's end.
+        stage_ms: Stage of the loop -> milliseconds of each pass.
+        session_uuid: Id of the log.
+        fixer: What the fixer says of itself and of its counts; empty without one.
+        has_camera: The policy has a camera.
+        renderer_facts, policy_facts: What these parts say of themselves.
+        metrics: METRIC -> value.
+        events: Outcomes, by time.
+        contacts: Beginnings of contacts, by time, where the preset searches between steps.
+        censored: What the rules removed.
+        error: Why it failed.
+        traceback: Of what failed.
+        final: The same code would fail again.
+        copied_from: Folder of the rollout that this one is a copy of.
+        reused: An earlier command drove it.
+        rollout: Of a scored log: its name.
+        log: Its path.
+        warnings: What is odd about it.
+        scene_score: AlpaSim's.
+        fork: How it continues another rollout.
+        node: Where Ray drove it.
+    """
+
+    renderer: str
+    policy: str
+    scene: str
+    seed: int
+    path: str
+    status: Status
+    wall_s: float | None
+    files: dict[str, FileFacts] = field(default_factory=dict)
+    rollout_key: str | None = None
+    made_of: dict[str, str | None] | None = None
+    score_key: str | None = None
+    preset: str | None = None
+    stops_at_path_end: bool | None = None
+    video: str | None = None
+    inputs: dict[str, str] = field(default_factory=dict)
+    score_inputs: dict[str, str] = field(default_factory=dict)
+    frames: int | None = None
+    first_call_frames: int | None = None
+    steps: int | None = None
+    frame_events: dict[str, int] = field(default_factory=dict)
+    passed_path_end: bool = False
+    ended: str | None = None
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    session_uuid: str | None = None
+    fixer: JsonObject = field(default_factory=dict)
+    has_camera: bool | None = None
+    renderer_facts: JsonObject | None = None
+    policy_facts: JsonObject | None = None
+    metrics: dict[str, MetricValue] = field(default_factory=dict)
+    events: tuple[DriveEvent, ...] = ()
+    contacts: tuple[Contact, ...] = ()
+    censored: Ledger | None = None
+    error: RolloutError | None = None
+    traceback: str | None = None
+    final: bool | None = None
+    copied_from: str | None = None
+    reused: bool | None = None
+    rollout: str | None = None
+    log: str | None = None
+    warnings: tuple[str, ...] | None = None
+    scene_score: SceneScore | None = None
+    fork: Fork | None = None
+    node: str | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Tell whether the rollout ran to its end and was scored."""
+        return self.status == "ok"
+
+    @property
+    def cell(self) -> tuple[str, str, str, int]:
+        """Give the key renderer, policy, scene, seed."""
+        return (self.renderer, self.policy, self.scene, self.seed)
+
+    @property
+    def failure_class(self) -> str:
+        """Give whose fault a failed rollout is."""
+        return "unknown" if self.error is None else self.error.failure_class
 
 
 @dataclass(frozen=True)

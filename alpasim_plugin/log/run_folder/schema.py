@@ -49,9 +49,6 @@ MANIFEST = "manifest.json"  # written last, with the digests of DRIVEN and DERIV
 # Only driving makes them.
 DRIVEN = (LOG_NAME, FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME, VIDEO_NAME)
 DERIVED = (STEPS_NAME,)  # made from the log
-# Members of a manifest: what was read beside what a key holds, digest by path.
-INPUTS = "inputs"  # while the rollout was driven
-SCORE_INPUTS = "score_inputs"  # while it was scored
 
 
 @dataclass(frozen=True)

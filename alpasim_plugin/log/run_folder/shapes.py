@@ -10,22 +10,9 @@ from typing import Annotated, Any
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from alpasim_plugin.log.run_folder.checksums import FileFacts
-
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Line = list[Annotated[list[Coordinate], Field(min_length=2, max_length=3)]]
 Facts = dict[str, Any]
-
-
-class ManifestFile(TypedDict):
-    """``manifest.json`` of a rollout."""
-
-    files: dict[str, FileFacts]
-    renderer: str
-    policy: str
-    scene: str
-    path: str
-    status: str
 
 
 class MapLane(TypedDict):

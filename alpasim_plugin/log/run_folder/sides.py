@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,51 +17,83 @@ import pyarrow.parquet as pq
 
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, metrics_in
 
 AGAIN = "Write the tables of this run again with its own command."
 
-Row = Mapping[str, Any]
+Row = Mapping[str, Any]  # of rollouts.parquet
 Cell = tuple[str, str, int]  # policy, scene, seed: what two renderers share
 
 
-def value_of(row: Row, metric: str) -> float | None:
-    """Return a metric of a row, None where absent, not valid, or not finite."""
-    value, valid, _ = _entry_of(row, metric)
-    return float(value) if valid and value is not None and np.isfinite(float(value)) else None
+@dataclass(frozen=True)
+class RolloutValues:
+    """One rollout as statistics read it.
 
-
-def reason_of(row: Row, metric: str) -> str:
-    """Return why a metric of a rollout is not valid, as far as the row knows."""
-    return str(_entry_of(row, metric)[2] or "not given")
-
-
-def _entry_of(row: Row, metric: str) -> tuple[Any, Any, Any]:
-    """Return value, valid and reason of a metric of a row: flat (``rollouts.parquet``), or nested
-    (a manifest, or a reduction that was not written yet).
+    Attributes:
+        cell: Policy, scene, seed.
+        ok: It ran to its end.
+        failure_class: Whose fault it is that it did not.
+        values: METRIC -> value; None where it is not valid or not finite.
+        reasons: METRIC -> why it is not valid, as far as it is known.
     """
-    nested = row.get("metrics")
-    if not isinstance(nested, Mapping):
-        return row.get(metric), row.get(metric + VALID, True), row.get(f"{metric}_reason")
-    entry = nested.get(metric)
-    if entry is None:
-        return None, False, None
-    facts = entry if isinstance(entry, Mapping) else vars(entry)
-    return facts["value"], facts["valid"], facts.get("reason")
+
+    cell: Cell
+    ok: bool
+    failure_class: str
+    values: Mapping[str, float | None]
+    reasons: Mapping[str, str]
+
+    @classmethod
+    def of_manifest(cls, manifest: Manifest) -> RolloutValues:
+        """Take the values of a manifest."""
+        metrics = manifest.metrics
+        return cls(
+            cell=(manifest.policy, manifest.scene, manifest.seed),
+            ok=manifest.ok,
+            failure_class=manifest.failure_class,
+            values={
+                name: _finite(entry.value) if entry.valid else None
+                for name, entry in metrics.items()
+            },
+            reasons={name: entry.reason for name, entry in metrics.items() if entry.reason},
+        )
+
+    @classmethod
+    def of_row(cls, row: Row) -> RolloutValues:
+        """Take the values of a row as ``rollouts.parquet`` has them.
+
+        A caller's row may leave out METRIC_valid, where the value is valid, and may say why it is
+        not in METRIC_reason.
+        """
+        names = [name for name, value in row.items() if value is None or isinstance(value, Real)]
+        reasons = {name: row.get(f"{name}_reason") for name in names}
+        return cls(
+            cell=(str(row["policy"]), str(row["scene"]), int(row["seed"])),
+            ok=row.get("status", "ok") == "ok",
+            failure_class=row.get("failure_class") or "unknown",
+            values={name: value_of(row, name) for name in names},
+            reasons={name: str(reason) for name, reason in reasons.items() if reason},
+        )
 
 
-def failure_of(row: Row) -> str:
-    """Return the failure class of a rollout that did not run to its end."""
-    error = row.get("error") or {}
-    return str(row.get("failure_class") or error.get("failure_class") or "unknown")
+def value_of(row: Row, metric: str) -> float | None:
+    """Return a metric of a row of ``rollouts.parquet``; None where absent, not valid, or not
+    finite.
+    """
+    return _finite(row.get(metric)) if row.get(metric + VALID, True) else None
+
+
+def _finite(value: float | None) -> float | None:
+    """Return a number; None where it is missing or not finite."""
+    return None if value is None or not np.isfinite(float(value)) else float(value)
 
 
 def metric_names(rows: Iterable[Row]) -> list[str]:
     """Return the metrics that any row carries, in order of appearance."""
     names: dict[str, None] = {}
     for row in rows:
-        nested = row.get("metrics")
-        names |= dict.fromkeys(nested if isinstance(nested, Mapping) else metrics_in(row))
+        names |= dict.fromkeys(metrics_in(row))
     return list(names)
 
 
@@ -77,7 +110,6 @@ class Side:
             value is not valid or not finite.
         reason: (rollout, metric) -> why the metric is not valid, as far as it is known.
         failure: Rollout -> failure class of one that did not run to its end.
-        rows: ``(R,)`` the rollouts themselves; empty for a side that was read from a table.
     """
 
     ok: Bool
@@ -87,7 +119,6 @@ class Side:
     raw: Callable[[str], F64]
     reason: Callable[[int, str], str]
     failure: Callable[[int], str]
-    rows: tuple[Row, ...] = ()
     _places: dict[Side, I64] = field(default_factory=dict, init=False)
 
     @classmethod
@@ -98,32 +129,29 @@ class Side:
         raw: Callable[[str], F64],
         reason: Callable[[int, str], str],
         failure: Callable[[int], str],
-        rows: tuple[Row, ...] = (),
     ) -> Side:
         """Lay out rollouts by their cells; ``keys`` ``(R,)`` may repeat."""
         cells = tuple(sorted(set(keys)))
         number = {cell: i for i, cell in enumerate(cells)}
         _, scene = np.unique([scene for _, scene, _ in cells], return_inverse=True)
         cell = np.array([number[key] for key in keys], np.int64)
-        return cls(ok, cells, cell, scene, raw, reason, failure, rows)
+        return cls(ok, cells, cell, scene, raw, reason, failure)
 
     @classmethod
-    def of(cls, rows: Sequence[Row]) -> Side:
-        """Lay out rows of one renderer, flat (``rollouts.parquet``) or nested (manifests)."""
-        keys = [(str(row["policy"]), str(row["scene"]), int(row["seed"])) for row in rows]
-        ok = np.array([row.get("status", "ok") == "ok" for row in rows], bool)
+    def of(cls, rollouts: Sequence[RolloutValues]) -> Side:
+        """Lay out rollouts of one renderer."""
+        ok = np.array([rollout.ok for rollout in rollouts], bool)
 
         def raw(metric: str) -> F64:
-            values = np.array([value_of(row, metric) for row in rows], np.float64)
-            return np.where(ok, values, np.nan)
+            values = [rollout.values.get(metric) for rollout in rollouts]
+            return np.where(ok, np.array(values, np.float64), np.nan)
 
         return cls.laid_out(
-            keys,
+            [rollout.cell for rollout in rollouts],
             ok,
             raw,
-            lambda row, metric: reason_of(rows[row], metric),
-            lambda row: failure_of(rows[row]),
-            tuple(rows),
+            lambda number, metric: rollouts[number].reasons.get(metric, "not given"),
+            lambda number: rollouts[number].failure_class,
         )
 
     def place_in(self, other: Side) -> I64:
@@ -167,11 +195,11 @@ class Side:
 
 
 def by_renderer(rows: Sequence[Row]) -> dict[str, Side]:
-    """Return each renderer's rollouts, in order of appearance."""
-    split: dict[str, list[Row]] = {}
+    """Return each renderer's rollouts, of rows of ``rollouts.parquet``, in order of appearance."""
+    rollouts: dict[str, list[RolloutValues]] = {}
     for row in rows:
-        split.setdefault(str(row["renderer"]), []).append(row)
-    return {name: Side.of(mine) for name, mine in split.items()}
+        rollouts.setdefault(str(row["renderer"]), []).append(RolloutValues.of_row(row))
+    return {name: Side.of(of_renderer) for name, of_renderer in rollouts.items()}
 
 
 class RolloutTable:

@@ -21,9 +21,9 @@ from alpasim_plugin.core.files.tables import read_parquet
 from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Actor, Scenario, Scene
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import (
     FILES,
-    KEYS,
     LOCK,
     ROLLOUTS,
     ROLLOUTS_TABLE,
@@ -105,32 +105,38 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
     return removed
 
 
-def rollout_rows(manifests: Sequence[JsonObject]) -> list[JsonObject]:
-    """Return one flat row per rollout: its key, its status, and every metric with its validity.
-
-    An infinite value, for which JSON has no number, is the text "inf" or "-inf" in a manifest, and
-    a number here.
-    """
+def rollout_rows(manifests: Sequence[Manifest]) -> list[JsonObject]:
+    """Return one flat row per rollout: its key, its status, and every metric with its validity."""
     rows = []
     for manifest in manifests:
-        error = manifest.get("error") or {}
+        error = manifest.error
         row: JsonObject = {
-            **{key: manifest[key] for key in (*KEYS, "status", "path", "wall_s")},
-            **{key: manifest.get(key) for key in ("rollout", "copied_from", "frames", "steps")},
-            "failure_class": error.get("failure_class"),
-            "failure": error.get("message"),
+            "renderer": manifest.renderer,
+            "policy": manifest.policy,
+            "scene": manifest.scene,
+            "seed": manifest.seed,
+            "rollout": manifest.rollout,
+            "status": manifest.status,
+            "failure_class": None if error is None else error.failure_class,
+            "failure": None if error is None else error.message,
+            "path": manifest.path,
+            "copied_from": manifest.copied_from,
+            "wall_s": manifest.wall_s,
+            "frames": manifest.frames,
+            "steps": manifest.steps,
         }
-        for name, entry in manifest.get("metrics", {}).items():
-            row[name] = None if entry["value"] is None else float(entry["value"])
-            row[name + VALID] = entry["valid"]
+        for name, entry in manifest.metrics.items():
+            row[name] = entry.value
+            row[name + VALID] = entry.valid
         rows.append(row)
     return rows
 
 
-def rollout_table(manifests: Sequence[JsonObject]) -> pa.Table:
+def rollout_table(manifests: Sequence[Manifest]) -> pa.Table:
     """Return the content of ``rollouts.parquet``, a row per manifest."""
-    metrics = dict.fromkeys(name for manifest in manifests for name in manifest.get("metrics", {}))
-    schema = ROLLOUTS_TABLE.arrow(metrics, any("rollout" in manifest for manifest in manifests))
+    metrics = dict.fromkeys(name for manifest in manifests for name in manifest.metrics)
+    of_logs = any(manifest.rollout is not None for manifest in manifests)
+    schema = ROLLOUTS_TABLE.arrow(metrics, of_logs)
     starts = range(0, len(manifests), CHUNK_ROWS)
     batches = [
         pa.RecordBatch.from_pylist(rollout_rows(manifests[start : start + CHUNK_ROWS]), schema)
@@ -139,7 +145,7 @@ def rollout_table(manifests: Sequence[JsonObject]) -> pa.Table:
     return pa.Table.from_batches(batches, schema)
 
 
-def write_tables(root: Path, manifests: Sequence[JsonObject], tables: Path) -> pa.Table:
+def write_tables(root: Path, manifests: Sequence[Manifest], tables: Path) -> pa.Table:
     """Write ``rollouts.parquet`` and ``steps.parquet`` of a run folder and return the first.
 
     Args:
@@ -152,7 +158,7 @@ def write_tables(root: Path, manifests: Sequence[JsonObject], tables: Path) -> p
     """
     rollouts = rollout_table(manifests)
     write_parquet(tables / ROLLOUTS, rollouts)
-    parts = (root / m["path"] / STEPS_NAME for m in manifests if m["status"] == "ok")
+    parts = (root / manifest.path / STEPS_NAME for manifest in manifests if manifest.ok)
     path = tables / STEPS
     schema = STEPS_TABLE.arrow(of_logs="rollout" in rollouts.column_names)
     path.parent.mkdir(parents=True, exist_ok=True)
