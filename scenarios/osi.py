@@ -396,7 +396,7 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
     ]
     if not facts.centerline_is_driving_direction:
-        sides = [(edge[::-1], mark_type) for edge, mark_type in sides[::-1]]
+        sides = [(edge[::-1], mark_type) for edge, mark_type in reversed(sides)]
         ahead = [str(pair.antecessor_lane_id.value) for pair in pairing]
         beside = beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):

@@ -164,17 +164,22 @@ class OneFixer(Fixer):
             self._pending = tuple(
                 self._fix(view, history) for view, history in zip(views, self._history, strict=True)
             )
-        out = list(block)
+        return self._with_images(block)
+
+    def _with_images(self, block: Sequence[Frame]) -> tuple[Frame, ...]:
+        """Return the frames with the pending block's images; where the network failed, the event in
+        place of an image.
+        """
+        frames = list(block)
         for fixed in self._pending:
             for b, indices in enumerate(fixed.views.index):
                 for t, i in enumerate(indices):
                     event = fixed.events[b][t]
-                    out[i] = (
-                        replace(block[i], events=(*block[i].events, event))
-                        if event
-                        else replace(block[i], rgb=fixed.images[b, t])
-                    )
-        return tuple(out)
+                    if event:
+                        frames[i] = replace(block[i], events=(*block[i].events, event))
+                    else:
+                        frames[i] = replace(block[i], rgb=fixed.images[b, t])
+        return tuple(frames)
 
     def step(self, block: Sequence[Frame], maps: Sequence[U8]) -> Sequence[Frame]:
         """Fix a block and add it to the history. A block equal to the last preview's is not

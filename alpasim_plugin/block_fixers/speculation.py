@@ -165,18 +165,7 @@ class SpeculativeRenderer(FixedRenderer):
             frames = [frame for _, frame in predicted]
             shown_errors = forecasts
         else:
-            # A draft: the true frames so far with the predicted rest of the block.
-            left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
-            coming = min(left, *(len(request.ahead) for request in ordered))
-            block = list(self.true)
-            block += [
-                self.runner.render([request.ahead[k] for request in ordered]) for k in range(coming)
-            ]
-            fixed = self._fix(self.fixer.preview, block)
-            self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]
-            self.stats.drafts += 1
-            self.stats.redrafts += len(self.true) > 1
-            frames = fixed[len(self.true) - 1]
+            frames = self._fix_draft(ordered)
         self.stats.frames += len(ordered)
         self.stats.predicted += len(forecasts)
         self.stats.hits += len(ordered) if is_hit else 0
@@ -194,6 +183,22 @@ class SpeculativeRenderer(FixedRenderer):
         flat = self.runner.fix(self.fixer, call, [item for items in block for item in items])
         n = len(self.cameras)
         return [flat[i : i + n] for i in range(0, len(flat), n)]
+
+    def _fix_draft(self, requests: Sequence[RenderRequest]) -> list[Frame]:
+        """Fix the true frames so far with the predicted rest of the block, and return the frames of
+        this instant.
+        """
+        left = self.fixer.blocks.frames(self.stats.blocks) - len(self.true)
+        coming = min(left, *(len(request.ahead) for request in requests))
+        block = list(self.true)
+        block += [
+            self.runner.render([request.ahead[k] for request in requests]) for k in range(coming)
+        ]
+        fixed = self._fix(self.fixer.preview, block)
+        self.draft = [list(zip(*pair, strict=True)) for pair in zip(block, fixed, strict=True)]
+        self.stats.drafts += 1
+        self.stats.redrafts += len(self.true) > 1
+        return fixed[len(self.true) - 1]
 
     def _check(self, requests: Sequence[RenderRequest]) -> None:
         names = [request.camera.name for request in requests]

@@ -246,6 +246,19 @@ def usual(args: list[str]) -> list[str]:
     Raises:
         InputError: A comma stands between two words of which no list is made.
     """
+    words = _with_joined_lists(args)
+    if words[:1] == ["help"]:
+        is_known = len(words) == 1 or words[1] in verbs()
+        return [*words[1:2], "--help"] if is_known else words[1:2]
+    if words and words[0] in ("version", "-v", "-V"):
+        return ["--version", *words[1:]]
+    if len(words) > 1 and words[0] in ANYWHERE and words[1] in verbs():
+        return [words[1], words[0], *words[2:]]
+    return words
+
+
+def _with_joined_lists(args: list[str]) -> list[str]:
+    """Join the words of a list with spaces beside its commas, where an option takes a list."""
     words: list[str] = []
     for word in args:
         is_seeds = words[-2:-1] == ["--seeds"] and not word.strip(",").isdecimal()
@@ -262,13 +275,6 @@ def usual(args: list[str]) -> list[str]:
                 "Write spaces alone; after a name that ends with a comma write a slash.",
             )
         words[-1] += word
-    if words[:1] == ["help"]:
-        is_known = len(words) == 1 or words[1] in verbs()
-        return [*words[1:2], "--help"] if is_known else words[1:2]
-    if words and words[0] in ("version", "-v", "-V"):
-        return ["--version", *words[1:]]
-    if len(words) > 1 and words[0] in ANYWHERE and words[1] in verbs():
-        return [words[1], words[0], *words[2:]]
     return words
 
 

@@ -151,14 +151,7 @@ class Exchange:
         while (frame := self.bus.recv(0)) is not None:
             self.counts["late"] += bool(self._take(frame, t_us))
         self._send_due(t_us, quantities)
-        began = self.clock()
-        waiting = {id(self._steer), id(self._accel)}
-        while waiting and (left := began + self.timeout_s - self.clock()) > 0:
-            frame = self.bus.recv(left)
-            if frame is not None:
-                waiting -= {id(one) for one in self._take(frame, t_us)}
-        if not waiting:
-            self.latencies_s.append(self.clock() - began)
+        waiting = self._wait(t_us)
         self._began_us = t_us if self._began_us is None else self._began_us
         wheel = self._steer.value
         accel = self._accel.value
@@ -175,6 +168,20 @@ class Exchange:
             ramp = min(accel or 0.0, 0.0) - RAMP_MPS3 * max(over_us, 0) * 1e-6
             accel = max(ramp, STOP_MPS2)
         return Commands(wheel or 0.0, accel or 0.0, mark)
+
+    def _wait(self, t_us: int) -> bool:
+        """Take answers until both commands are new; return whether one still is not, after the time
+        limit.
+        """
+        began = self.clock()
+        waiting = {id(self._steer), id(self._accel)}
+        while waiting and (left := began + self.timeout_s - self.clock()) > 0:
+            frame = self.bus.recv(left)
+            if frame is not None:
+                waiting -= {id(command) for command in self._take(frame, t_us)}
+        if not waiting:
+            self.latencies_s.append(self.clock() - began)
+        return bool(waiting)
 
     def _send_due(self, t_us: int, quantities: Mapping[str, float]) -> None:
         for sent in self.codec.map.send:

@@ -30,7 +30,13 @@ from alpasim_plugin.fixers.network.pixel_generator import (
     content_key,
     noise_key,
 )
-from alpasim_plugin.fixers.network.reference_blend import FINER_PX, HALF, enlarged, in_bytes
+from alpasim_plugin.fixers.network.reference_blend import (
+    FINER_PX,
+    HALF,
+    BlendHeads,
+    enlarged,
+    in_bytes,
+)
 from alpasim_plugin.fixers.network.schedule import from_names, interpolant
 from alpasim_plugin.fixers.pixel_network import LoadedGenerator, load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
@@ -178,13 +184,34 @@ def fix_frame(
     measured = guard.measures(video[visible], levels, rgb, *before)
     sums = trust_sums(output, after.render[visible], after.recorded[visible])
     if scale > 1:
-        heads, recorded = repaired.heads, inputs.references
-        finer = net.finer if scale >= FINER_FROM else None
-        if heads is not None and recorded is not None and finer is not None:
-            parts = (operations.smaller(part, FINER_PX) for part in (inputs.rgb, recorded))
-            heads = heads._replace(finer=finer(*parts, change, heads.weight, scale))
-        levels = operations.enlarge(inputs.rgb, change, recorded, heads, scale)
+        levels = _enlarged_frame(generator, inputs, change, repaired.heads, scale)
     return FixedFrame(levels, measured, sums, *after)
+
+
+def _enlarged_frame(
+    generator: LoadedGenerator,
+    inputs: GivenFrame,
+    change: Tensor,
+    heads: BlendHeads | None,
+    scale: int,
+) -> Tensor:
+    """Return the large frame with the change that was found on the smaller one.
+
+    Args:
+        generator: Network and operations.
+        inputs: The large frame.
+        change: What the network added, ``scale`` times smaller.
+        heads: Where references are looked up; None without references.
+        scale: How many times smaller the network's frame was.
+    """
+    net = generator.net
+    operations = generator.operations
+    recorded = inputs.references
+    finer = net.finer if scale >= FINER_FROM else None
+    if heads is not None and recorded is not None and finer is not None:
+        parts = (operations.smaller(part, FINER_PX) for part in (inputs.rgb, recorded))
+        heads = heads._replace(finer=finer(*parts, change, heads.weight, scale))
+    return operations.enlarge(inputs.rgb, change, recorded, heads, scale)
 
 
 @lru_cache(maxsize=8)

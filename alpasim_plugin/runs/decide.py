@@ -38,6 +38,8 @@ from evaluators.statistics.decision import (
 )
 from evaluators.statistics.gate import failures_of
 from evaluators.statistics.variants import (
+    Base,
+    Variant,
     base_named,
     short_name,
     usual_base,
@@ -66,12 +68,7 @@ def plan_of_two(
     named = plan.options.baseline
     base = usual_base(variants) if named is None else base_named(named, variants, "the plan")
     if len(variants) == 4 and base.renderer is not None and base.policy is not None:
-        variants = [
-            variant
-            for variant in variants
-            if variant == base.of(variant)
-            or (base.renderer != variant.renderer and base.policy != variant.policy)
-        ]
+        variants = [variant for variant in variants if _is_base_or_opposite(variant, base)]
     if len(variants) != 2:
         raise InputError(
             f"--until-decided: {len(variants)} variants",
@@ -90,6 +87,12 @@ def plan_of_two(
     key = digest([asdict(question), scenes_per_look, ORDER_SEED])
     options = replace(plan.options, baseline=base.name)
     return replace(plan, cells=cells, options=options, question=key)
+
+
+def _is_base_or_opposite(variant: Variant, base: Base) -> bool:
+    """Tell whether a variant is the baseline, or has neither its renderer nor its policy."""
+    is_opposite = base.renderer != variant.renderer and base.policy != variant.policy
+    return variant == base.of(variant) or is_opposite
 
 
 def drawing_order(scenes: Sequence[str]) -> list[str]:

@@ -118,14 +118,8 @@ def export_mcap(run: Run, cell: WatchedCell, logs: Logs, path: Path) -> JsonObje
         items.insert(0, _map_item(scene_data, recorded[0].ego_log.xyz, first_us))
     facts = _facts(run, cell) | {"recording": cell.name, "notes": "\n".join(notes)}
     counts = _write(path, items, facts)
-    return {
-        "recording": cell.name,
-        "file": str(path),
-        "bytes": path.stat().st_size,
-        "messages": sum(counts.values()),
-        "channels": counts,
-        "notes": notes,
-    }
+    size = {"bytes": path.stat().st_size, "messages": sum(counts.values()), "channels": counts}
+    return {"recording": cell.name, "file": str(path), **size, "notes": notes}
 
 
 def _usable_log(cell: WatchedCell, rollout: Rollout, logs: Logs) -> RolloutLog | None:

@@ -341,24 +341,39 @@ class BoundarySearch:
                 for seed, failed in seeds.items()
             }
         }
-        reasons = [one for one in ended.values() if isinstance(one, str)]
-        areas = {seed: one for seed, one in ended.items() if isinstance(one, Area)}
-        brackets = [one for one in ended.values() if isinstance(one, Bracket)]
-        sides = {one.fails_below for one in brackets}
+        areas = {seed: end for seed, end in ended.items() if isinstance(end, Area)}
+        brackets = [end for end in ended.values() if isinstance(end, Bracket)]
+        reasons = [end for end in ended.values() if isinstance(end, str)]
         if self.stopped:
             reasons.append("not finished")
-        elif len(sides) > 1:
+        elif len({bracket.fails_below for bracket in brackets}) > 1:
             reasons.append("fails on either side, by seed")
         if reasons:
             counted = [f"{why} in {reasons.count(why)} of {len(ended)} seeds" for why in reasons]
             return facts | {"reason": "; ".join(dict.fromkeys(counted))}, []
         if self.is_area:
-            facts["contradictions"] = sum(one.contradictions for one in areas.values())
-            facts["areas"] = {str(seed): vars(one) for seed, one in areas.items()}
-            return facts | vars(boundary_of(list(areas.values()))), list(areas.values())
-        side = "below" if sides.pop() else "above"
-        changes = max(one.changes for one in brackets)
-        return facts | {"fails": side, "changes": changes} | vars(boundary_of(brackets)), brackets
+            return facts | _area_facts(areas), list(areas.values())
+        return facts | _bracket_facts(brackets), brackets
+
+
+def _area_facts(areas: Mapping[int, Area]) -> JsonObject:
+    """Return the facts of a boundary in two parameters, of which each seed has an area."""
+    return {
+        "contradictions": sum(area.contradictions for area in areas.values()),
+        "areas": {str(seed): vars(area) for seed, area in areas.items()},
+        **vars(boundary_of(list(areas.values()))),
+    }
+
+
+def _bracket_facts(brackets: Sequence[Bracket]) -> JsonObject:
+    """Return the facts of a boundary along one parameter, of which each seed has a bracket; all fail
+    on the same side.
+    """
+    return {
+        "fails": "below" if brackets[0].fails_below else "above",
+        "changes": max(bracket.changes for bracket in brackets),
+        **vars(boundary_of(brackets)),
+    }
 
 
 def _steps(failed: Mapping[Point, bool]) -> dict[int, bool]:

@@ -189,7 +189,7 @@ def _walls(
     """Cover walls with Gaussians at each level of `CELLS`, and return clouds and each Gaussian's
     wall.
     """
-    starts, ends, base, height, owner, is_front = walls
+    starts, ends, _, height, owner, is_front = walls
     length = np.linalg.norm(ends - starts, axis=1)
     bays = cell_counts(length, BAY_M)
     floors = cell_counts(height, FLOOR_M)
@@ -232,7 +232,6 @@ def _walls(
     rgb[door] = style["awning"][house[door]] * 0.6
 
     levels = []
-    quats = _facing(site, starts, ends)
     for cells, _ in CELLS:
         across = bays * cells
         up = floors * cells
@@ -240,17 +239,34 @@ def _walls(
         block = finest // cells
         cell = begin[wall] + row // block * across[wall] + column // block
         mean = np.column_stack([np.bincount(cell, channel) for channel in rgb.T]) / block**2
-        covered, u, v = grid_cells(across, up)
-        plan = starts[covered] + u[:, None] * (ends - starts)[covered]
-        z = base[covered] - 0.2 + v * (height[covered] + 0.2)
-        scales = (
-            SPREAD * (length / across)[covered],
-            np.full(len(covered), 0.05),
-            SPREAD * ((height + 0.2) / up)[covered],
-        )
-        means = np.column_stack([site.frame.to_world(plan), z])
-        levels.append((cloud_of(means, quats[covered], np.column_stack(scales), mean), covered))
+        levels.append(_covered(site, walls, across, up, mean))
     return levels
+
+
+def _covered(
+    site: Site, walls: _Walls, across: I64, up: I64, rgb: F64
+) -> tuple[GaussianCloud, I64]:
+    """Cover walls with a grid of Gaussians, and return them and each one's wall.
+
+    Args:
+        site: The scene.
+        walls: All walls.
+        across, up: ``(W,)`` Gaussians along and above one another on each wall.
+        rgb: ``(N, 3)`` their colours, wall by wall and row by row.
+    """
+    starts, ends, base, height, _, _ = walls
+    length = np.linalg.norm(ends - starts, axis=1)
+    wall, u, v = grid_cells(across, up)
+    plan = starts[wall] + u[:, None] * (ends - starts)[wall]
+    z = base[wall] - 0.2 + v * (height[wall] + 0.2)
+    scales = (
+        SPREAD * (length / across)[wall],
+        np.full(len(wall), 0.05),
+        SPREAD * ((height + 0.2) / up)[wall],
+    )
+    means = np.column_stack([site.frame.to_world(plan), z])
+    quats = _facing(site, starts, ends)[wall]
+    return cloud_of(means, quats, np.column_stack(scales), rgb), wall
 
 
 def _facing(site: Site, start: F64, end: F64) -> F64:

@@ -294,6 +294,18 @@ def _lane(
     )
 
 
+def _slanting_lane(name: str, centre: F64, left: F64, right: F64, profile: Profile) -> Lane:
+    return Lane(
+        name,
+        centre,
+        left,
+        right,
+        left_mark_type="none",
+        right_mark_type=profile.edge_mark_type,
+        speed_limit_mps=profile.speed_limit_mps,
+    )
+
+
 def build_taper(
     draft: MapDraft, name: str, curve: F64, profile: Profile, kind: str, joint: Joint
 ) -> tuple[Strip, str]:
@@ -343,16 +355,7 @@ def build_taper(
     strip = _add_lanes(draft, name, lines, profile)
     outermost = draft.lanes[strip.forward[-1]]  # the slanting lane crosses its edge
     draft.lanes[outermost.lane_id] = replace(outermost, right_mark_type="dashed_white")
-    slanting_lane = Lane(
-        f"{name}_{kind}",
-        centre,
-        left,
-        right,
-        left_mark_type="none",
-        right_mark_type=profile.edge_mark_type,
-        speed_limit_mps=profile.speed_limit_mps,
-    )
-    slant = draft.add(slanting_lane)
+    slant = draft.add(_slanting_lane(f"{name}_{kind}", centre, left, right, profile))
     add_sides(draft, name, {**lines, f"f{n}": right, "right": edge}, profile)
     end_lines = {**lines, "right": edge}
     if kind == "split":

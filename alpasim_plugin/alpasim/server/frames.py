@@ -99,6 +99,23 @@ class FrameServer:
                 encode(self._sized(item.frame.rgb, size), form)
                 for item, size, form in zip(rendered, sizes, forms, strict=True)
             ]
+        nodes = self._nodes(requests, views, source, left)
+        images = [nodes[view.key].state.image for view in views]
+        return [
+            encode(self._sized(image, size), form)
+            for image, size, form in zip(images, sizes, forms, strict=True)
+        ]
+
+    def _nodes(
+        self,
+        requests: Sequence[Request],
+        views: Sequence[View],
+        source: FrameSource,
+        left: CallTime,
+    ) -> dict[bytes, Node[Answered]]:
+        """Return the fixed frames of a call by the keys of their views; those that no call has asked
+        for before are rendered and fixed.
+        """
         nodes: dict[bytes, Node[Answered]] = {}
         missing: dict[bytes, tuple[Request, View]] = {}
         for request, view in zip(requests, views, strict=True):
@@ -111,17 +128,10 @@ class FrameServer:
             # A camera's frames follow one another by time, however a call lists them.
             by_time = sorted(missing.values(), key=lambda pair: pair[1].t_us)
             requests_in_time, views_in_time = zip(*by_time, strict=True)
-            for item, view in zip(
-                source.render(requests_in_time, views_in_time, left),
-                views_in_time,
-                strict=True,
-            ):
+            rendered = source.render(requests_in_time, views_in_time, left)
+            for item, view in zip(rendered, views_in_time, strict=True):
                 nodes[view.key] = self._fixed(item, view, left)
-        images = [nodes[view.key].state.image for view in views]
-        return [
-            encode(self._sized(image, size), form)
-            for image, size, form in zip(images, sizes, forms, strict=True)
-        ]
+        return nodes
 
     def _fixed(self, item: Rendered, view: View, left: CallTime) -> Node[Answered]:
         assert self._fixers is not None

@@ -137,14 +137,18 @@ def prepare_map(lane_map: LaneMap) -> PreparedMap:
         ((CORNERS * np.array(box.size_m)) @ pose[:3, :3].T + (pose[:3, 3] - origin))[TRIANGLES]
         for pose, box in lane_map.signs
     ]
+    return PreparedMap(origin, _segments(pieces), _filled(rings, signs))
+
+
+def _filled(rings: Sequence[F64], signs: Sequence[F64]) -> Triangles:
+    """Return the triangles of crosswalks and of signs with their colours."""
     on_ground = np.concatenate([np.zeros((0, 3, 3)), *rings])
     triangles = np.concatenate([on_ground, *signs])
     style = np.empty((len(triangles), 7))
     style[: len(on_ground)] = (CROSSWALK_BIAS_M, *COLOURS["crosswalk"], *COLOURS["crosswalk"])
     style[len(on_ground) :] = (0.0, *COLOURS["sign"], *COLOURS["sign"])
     is_closed = np.zeros(len(triangles), dtype=bool)
-    filled = Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
-    return PreparedMap(origin, _segments(pieces), filled)
+    return Triangles(triangles, is_closed, np.zeros((len(triangles), 3)), style)
 
 
 def _check_outline(name: str, outline: F64) -> None:

@@ -81,9 +81,8 @@ def fit_drive(
     """
     tell = report or (lambda stage, done, all, numbers: None)
     if not views:
-        raise InputError(
-            f"{scene_id}: no photograph", "give at least some ten photographs along the way"
-        )
+        do_this = "give at least some ten photographs along the way"
+        raise InputError(f"{scene_id}: no photograph", do_this)
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     train, guesses = prepared_views(views, tell)
     actors_in_view = {name for view in train for name in view.actors}
@@ -102,10 +101,9 @@ def fit_drive(
         device=device,
         report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
     )
-    after = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
-    exposures = {view.name: view.gain for view in after} | {
-        name: _gain_near(after, name, camera) for name, camera in (kept or {}).items()
-    }
+    fitted = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
+    exposures = {view.name: view.gain for view in fitted}
+    exposures |= {name: _gain_near(fitted, name, camera) for name, camera in (kept or {}).items()}
     return FittedDrive(model, exposures)
 
 

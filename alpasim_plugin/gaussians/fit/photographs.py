@@ -344,13 +344,7 @@ def _lens(frame: Mapping[str, Any], file: Path, location: str) -> Lens:
         )
     do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/renderers.md)"
     try:
-        size = (
-            (frame["w"], frame["h"])
-            if "w" in frame or not os.path.isfile(file)
-            else check_image(read_bytes(file, SOURCE_BYTES), file)
-        )
-        width = int(size[0])
-        height = int(size[1])
+        width, height = _image_size(frame, file)
         fl_x, fl_y = _focal_lengths(frame, width, height)
         if "fl_x" not in frame:  # angles are those of a camera that looks out of its middle
             frame = {"cx": width / 2, "cy": height / 2, **frame}
@@ -365,6 +359,14 @@ def _lens(frame: Mapping[str, Any], file: Path, location: str) -> Lens:
     return Lens(
         width, height, K, np.concatenate([distortion, few]), "fisheye" if fisheye else "opencv"
     ).check(location, do)
+
+
+def _image_size(frame: Mapping[str, Any], file: Path) -> tuple[int, int]:
+    """Return width and height, pixels, as the entry states them, else of the image itself."""
+    if "w" in frame or not os.path.isfile(file):
+        return int(frame["w"]), int(frame["h"])
+    width, height = check_image(read_bytes(file, SOURCE_BYTES), file)
+    return int(width), int(height)
 
 
 def rigid_pose(value: Any, location: str) -> F64:

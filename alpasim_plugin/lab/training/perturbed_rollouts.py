@@ -130,6 +130,34 @@ def _joined(*lines: F64) -> Path:
     return smooth_path(line[apart])
 
 
+@dataclass(frozen=True)
+class _Habits:
+    """How a driver errs. The speed must not say whether somebody comes: some drivers do not look,
+    some brake for nobody.
+
+    Attributes:
+        looks: Whether the driver gives way.
+        brakes_s, brakes_until_s: When the driver brakes for nobody; infinite: never.
+        brakes_mps2: How hard.
+        lag: 0 to 1; a delayed driver gets closer to the leader than the expert.
+    """
+
+    looks: bool
+    brakes_s: float
+    brakes_until_s: float
+    brakes_mps2: float
+    lag: float
+
+    @classmethod
+    def draw(cls, drive_s: float, random: np.random.Generator) -> _Habits:
+        """Draw the habits of a driver for a drive of some seconds."""
+        looks = random.random() < LOOKS_SHARE
+        brakes_s = np.inf if random.random() > HESITATES_SHARE else random.uniform(0.0, drive_s)
+        brakes_until_s = brakes_s + random.uniform(0.5, 3.0)
+        brakes_mps2 = random.uniform(1.0, 4.0)
+        return cls(looks, brakes_s, brakes_until_s, brakes_mps2, random.uniform(0.0, 1.0))
+
+
 def _drive(
     scenario: Scenario,
     path: Path,
@@ -163,13 +191,8 @@ def _drive(
         random,
         MAX_OFFSET_NEIGHBOUR_M if turn_s_m is None and neighbour_lines(scenario) else MAX_OFFSET_M,
     )
-    # The speed must not say whether somebody comes: some drivers do not look, some brake for nobody.
-    looks = random.random() < LOOKS_SHARE
-    brakes_s = np.inf if random.random() > HESITATES_SHARE else random.uniform(0.0, drive_s)
-    brakes_until_s = brakes_s + random.uniform(0.5, 3.0)
-    brakes_mps2 = random.uniform(1.0, 4.0)
+    habits = _Habits.draw(drive_s, random)
     states = []
-    lag = random.uniform(0.0, 1.0)  # a delayed driver gets closer to the leader than the expert
     accel = 0.0
     for step in range(round(drive_s / STEP_S)):
         t = t_us + round(step * STEP_S * 1e6)
@@ -180,14 +203,14 @@ def _drive(
         if step % round(FRAME_INTERVAL_S / STEP_S) == 0:
             states.append(_state_at(scenario, path, t, s, v, offset, step * STEP_S, actors, bodies))
         most = following_acceleration(v, ahead, driven_style)
-        if looks:
+        if habits.looks:
             most = min(most, others.acceleration(t, s, v, driven_style, others.in_sight(t, s)))
-        if brakes_s < step * STEP_S < brakes_until_s:
-            most = min(most, -brakes_mps2)
-        wanted = acceleration(line, s, v, most, driven_style)
-        accel += (wanted - accel) * (1.0 - 0.8 * lag)
+        if habits.brakes_s < step * STEP_S < habits.brakes_until_s:
+            most = min(most, -habits.brakes_mps2)
+        target = acceleration(line, s, v, most, driven_style)
+        accel += (target - accel) * (1.0 - 0.8 * habits.lag)
         if ahead.gap_m < 1.5:
-            accel = min(wanted, accel)
+            accel = min(target, accel)
         s, v = advance(s, v, accel, STEP_S)
         if leader is not None:
             leader.advance(STEP_S)

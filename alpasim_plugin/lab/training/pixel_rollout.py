@@ -208,22 +208,13 @@ def pixel_losses(
                     references,
                 )
     made = torch.stack(outputs, dim=1)
-    weight = torch.ones_like(sample.opacity)
-    if sample.road_users is not None:
-        weight = weight + (ROAD_USER - 1) * sample.road_users
-    # Row by row: the loss of rows is the mean of theirs.
-    weight = weight / weight.mean(dim=tuple(range(1, weight.ndim)), keepdim=True)
+    weight = _pixel_weights(sample)
     picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
     temporal = (weight[:, 1:] * moved.abs()).mean() if objectives.temporal and frames > 1 else zero
     perceptual = zero
     if objectives.perceptual and distance is not None:
-        (top, left), chosen = sample.corner, list(sample.perceptual_frames)
-        images = [
-            x[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2)
-            for x in (made, sample.truth)
-        ]
-        perceptual = distance(images[0], images[1]).mean()
+        perceptual = _perceptual_term(made, sample, distance)
     grid = grid_term(made, sample.truth) if objectives.grid else zero
     total = (
         objectives.picture * picture
@@ -234,6 +225,27 @@ def pixel_losses(
     return PixelLosses(
         total, picture, perceptual, temporal, flow, grid, choice, made, detached(state)
     )
+
+
+def _pixel_weights(sample: PixelSample) -> Tensor:
+    """Return the weight of each pixel, larger on road users; its mean in each row of the batch is 1,
+    so that the loss of rows is the mean of theirs.
+    """
+    weight = torch.ones_like(sample.opacity)
+    if sample.road_users is not None:
+        weight = weight + (ROAD_USER - 1) * sample.road_users
+    return weight / weight.mean(dim=tuple(range(1, weight.ndim)), keepdim=True)
+
+
+def _perceptual_term(made: Tensor, sample: PixelSample, distance: Distance) -> Tensor:
+    """Return the perceptual distance of some frames to the truth, in the sample's crop."""
+    top, left = sample.corner
+    chosen = list(sample.perceptual_frames)
+    images, truth = (
+        video[:, chosen, top:, left:].flatten(0, 1).permute(0, 3, 1, 2)
+        for video in (made, sample.truth)
+    )
+    return distance(images, truth).mean()
 
 
 def with_sources(

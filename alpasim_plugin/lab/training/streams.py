@@ -22,7 +22,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, I64, U8, Bool
+from alpasim_plugin.core.types import F32, F64, I64, U8, Bool
 from alpasim_plugin.lab.training.class_colours import OTHERS, swap_class_colours
 from alpasim_plugin.lab.training.drive_pairs import DRIVE
 from alpasim_plugin.lab.training.episode_references import (
@@ -305,13 +305,7 @@ class TrainingStreams:
         channels = rng.uniform(*CHANNEL_GAIN, 3)
         gamma = rng.uniform(*GAMMA)
         other = OTHERS[int(rng.integers(len(OTHERS)))]
-        grey = np.arange(256)[:, None] / 255
-        colours = (
-            np.clip(gain * channels * grey**gamma, 0, 1)
-            if photometric
-            else np.repeat(grey, 3, axis=1)
-        )
-        levels: F32 = (colours * 2 - 1).astype(np.float32)
+        levels = _levels(gain * channels, gamma) if photometric else _levels(np.ones(3), 1.0)
         step = (-1 if reverse else 1) * (2 if stride_2 else 1)
         detailed = rng.random() < P_DETAIL
         sharpness, grain = (
@@ -371,15 +365,11 @@ class TrainingStreams:
         target = _lit(cut(clip.rgb_gt), episode.levels)
         damaged = kind in ("pairs", "damaged_video")
         if not damaged:
-            target = _detailed(
-                target,
-                episode.sharpness,
-                episode.grain,
-                stream("training", self.seed, f"{episode.key}.grain", update),
-            )
-        render = (
-            _lit(cut(clip.rgb_input), episode.levels) if damaged and not episode.lost else target
-        )
+            random = stream("training", self.seed, f"{episode.key}.grain", update)
+            target = _detailed(target, episode.sharpness, episode.grain, random)
+        render = target
+        if damaged and not episode.lost:
+            render = _lit(cut(clip.rgb_input), episode.levels)
         opacity: F32 = np.ones((len(index), 1, *self.crop), dtype=np.float32)
         if episode.lost:
             render = episode.lost.apply(target)
@@ -392,18 +382,15 @@ class TrainingStreams:
         elif episode.sequence not in self.drives:  # a real fit is never exact where it looks so
             render = render + np.float32(episode.better) * (target - render)
         reference_crop = episode.references, index, rows, columns
-        recorded = (
-            pair_references(episode.sequence, *reference_crop)
-            if kind in ("pairs", "identity")
-            else video_references(clip, *reference_crop)
-        )
+        if kind in ("pairs", "identity"):
+            recorded = pair_references(episode.sequence, *reference_crop)
+        else:
+            recorded = video_references(clip, *reference_crop)
         references = _lit_references(recorded, episode)
         if episode.grey:
-            render, target, references[..., :3] = (
-                _grey(render, 1),
-                _grey(target, 1),
-                _grey(references[..., :3], -1),
-            )
+            render = _grey(render, 1)
+            target = _grey(target, 1)
+            references[..., :3] = _grey(references[..., :3], -1)
         other = episode.other.clip.sdmap if episode.map_error.kind == "other" else clip.sdmap
         sdmap = other if other.shape == clip.sdmap.shape else clip.sdmap
         users = road_users(episode.sequence, index, rows, columns)[:, None]
@@ -423,6 +410,13 @@ class TrainingStreams:
         return np.ascontiguousarray(
             map_frames.transpose(0, 3, 1, 2).astype(np.float32) / np.float32(127.5) - 1
         )
+
+
+def _levels(gain: F64, gamma: float) -> F32:
+    """Return what the 256 levels of a channel become ``(256, 3)``, -1 to 1."""
+    grey = np.arange(256)[:, None] / 255
+    colours = np.clip(gain * grey**gamma, 0, 1)
+    return (colours * 2 - 1).astype(np.float32)
 
 
 def there_and_back(index: I64, length: int) -> I64:
