@@ -35,11 +35,15 @@ PRONOUNS = frozenset(
 MOST = 0.005
 # Rooms without any.
 CLEAN = (
+    "alpasim_plugin.alpasim",
+    "alpasim_plugin.block_fixers",
     "alpasim_plugin.cameras",
     "alpasim_plugin.control",
+    "alpasim_plugin.core",
     "alpasim_plugin.drives",
     "alpasim_plugin.gym",
     "alpasim_plugin.renderers",
+    "alpasim_plugin.runs",
     "alpasim_plugin.streets",
     "alpasim_plugin.world",
     "policies",
