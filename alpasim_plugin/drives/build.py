@@ -285,10 +285,16 @@ def finished(out: Path, key: str) -> JsonObject:
             f"{out}: it exists and is no imported drive",
             "name a folder that does not exist yet",
         )
-    if read_json(out / KEY_FILE).get("key") != key:
+    stated = read_json(out / KEY_FILE)
+    if stated.get("key") != key:
         raise InputError(
-            f"{out}: it holds another import: of other files, other options or an older simrun",
+            f"{out}: it holds another import: of other files, or with other options",
             "name another folder, or remove this one first",
+        )
+    if stated.get("code") != package_digest():
+        raise InputError(
+            f"{out}: it was imported by another version of simrun",
+            "drive on it as it is, or remove it first: the same command imports it again",
         )
     return read_json(out / "quality.json")
 

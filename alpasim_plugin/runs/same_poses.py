@@ -81,8 +81,8 @@ def images_key(
     manifest: Manifest,
     manifests: Sequence[Manifest],
 ) -> str:
-    """Return the key of the images of a failure: of the log, of what the other renderers are, and of
-    the rollouts of those that have no digest.
+    """Return the key of the images of a failure: of the log, of what the other renderers are and
+    read, and of the rollouts of those that have no digest.
     """
     inputs = Inputs()
     inputs.setting("simrun", package_digest())
@@ -97,6 +97,9 @@ def images_key(
         if other.renderer in remote and other.scene == cell.scene
     ]
     inputs.setting("rollouts of remote renderers", driven)
+    # What renderers read by themselves is known from their rollouts of the scene.
+    read = [sorted(other.inputs.values()) for other in manifests if other.scene == cell.scene]
+    inputs.setting("files that rollouts read", read)
     return inputs.key
 
 

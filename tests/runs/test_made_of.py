@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
@@ -14,25 +14,32 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core import kernels
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import content_of, read_json
 from alpasim_plugin.core.files.arrays import open_npy, read_npz
 from alpasim_plugin.core.files.inputs import ABSENT, Inputs, note_files, unrecorded
 from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.parts.spec import part_digest
+from alpasim_plugin.drives import build as imports
+from alpasim_plugin.drives.build import KEY_FILE, SCENARIO_FILE, finished
 from alpasim_plugin.drives.build import read_inputs as drive_inputs
 from alpasim_plugin.drives.splat import read_inputs as splat_inputs
 from alpasim_plugin.gaussians.files.ply import write_ply
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
-from alpasim_plugin.renderers.reconstruction_key import reconstruction_key
+from alpasim_plugin.renderers import reconstruction_key as fits
+from alpasim_plugin.renderers.reconstruction_key import recipe_of, reconstruction_key
+from alpasim_plugin.runs import plan as plan_of_runs
 from alpasim_plugin.runs.changes import changed_evaluators
 from alpasim_plugin.runs.plan import RunOptions, make_plan
 from alpasim_plugin.runs.same_poses import images_key
 from evaluators import resolve_evaluators
 from scenarios import cameras
 from scenarios.load import load_scenario
-from scenarios.suite import ScenarioRef
+from scenarios.suite import ScenarioRef, expand
 from tests.drives.splat_model import poses_of, street_cloud
 from tests.drives.street import RIG_FROM_CAMERA, edited
 from tests.gaussians.sog_writer import write_sog
@@ -329,17 +336,20 @@ def test_images_of_other_renderers_are_those_of_their_log_and_renderers(scene, m
     (scene / "grey.py").write_text(RENDERER.replace("{path}", "grey.json"))
     (scene / "other.py").write_text(RENDERER.replace("{path}", "other.json"))
 
-    def key(*renderers, log="one"):
+    def key(*renderers, log="one", grey="90"):
         refs = [ScenarioRef(str(scene / "scene.yaml"))]
         plan = make_plan(refs, renderers, ("constant-velocity",), (0,), RunOptions())
         files = {LOG_NAME: {"bytes": 1, "mtime_ns": 1, "sha256": log}}
-        return images_key(plan, plan.cells[0], manifest({"files": files}), ())
+        of_grey = {"renderer": "grey.py:Grey", "scene": plan.cells[0].scene}
+        other = manifest({**of_grey, "inputs": {"grey.json": grey}})
+        return images_key(plan, plan.cells[0], manifest({"files": files}), [other])
 
     keys = [
         key("clean", "grey.py:Grey"),
         key("clean", "grey.py:Grey", log="two"),
         key("clean", "grey.py:Grey", "broken-black"),
         key("clean", "other.py:Grey"),
+        key("clean", "grey.py:Grey", grey="60"),
     ]
     assert key("clean", "grey.py:Grey") == keys[0]
     write_rig(scene, fl_x=60.0)
@@ -367,7 +377,7 @@ def test_a_record_holds_files_by_content_settings_by_value_and_inner_records(tmp
 
 
 EVALUATOR = """
-import scale_of_mine
+import {scale}
 from alpasim_plugin.core.files import read_json
 from alpasim_plugin.core.types import MetricInfo
 from evaluators.metrics.score import series
@@ -376,7 +386,7 @@ class Mine:
     metrics = {"mine_m": MetricInfo("m", "lower", "max", "a constant", margin=0.1)}
 
     def __call__(self, rollout, scene):
-        value = scale_of_mine.SCALE * read_json("{path}")["value"] * scale_of_mine.UNIT
+        value = {scale}.SCALE * read_json("{path}")["value"] * {scale}.UNIT
         return [series("mine_m", rollout.ego.t_us, value)]
 """
 SCALE = """
@@ -386,24 +396,29 @@ SCALE = 2.0
 """
 
 
+def scale_of(folder):
+    """Return the module that an evaluator imports: a process imports each name from one place."""
+    return folder / f"scale_of_{folder.name}.py"
+
+
 @pytest.fixture
 def evaluator(scene, monkeypatch):
     """Give an evaluator that reads a file, and a module of its own that reads one."""
     monkeypatch.chdir(scene)
     (scene / "value.json").write_text('{"value": 1.5}')
     (scene / "unit.json").write_text('{"unit": 1.0}')
-    (scene / "mine.py").write_text(EVALUATOR.replace("{path}", str(scene / "value.json")))
+    text = EVALUATOR.replace("{scale}", scale_of(scene).stem)
+    (scene / "mine.py").write_text(text.replace("{path}", str(scene / "value.json")))
     text = SCALE.replace("{path}", str(scene / "unit.json"))
-    (scene / "scale_of_mine.py").write_text(text)
+    scale_of(scene).write_text(text)
     (scene / "scene.yaml").write_text(SCENE.replace(HILLS, ""))
     return scene
 
 
-EDITS_OF_AN_EVALUATOR = {
-    "value.json": ("1.5", "2.5", 5.0),
-    "unit.json": ("1.0", "10.0", 50.0),
-    "scale_of_mine.py": ("SCALE = 2.0", "SCALE = 3.0", 75.0),
-}
+EDITS_OF_AN_EVALUATOR = (
+    ({"value.json": ("1.5", "2.5"), "unit.json": ("1.0", "10.0")}, 50.0),
+    ({"scale": ("SCALE = 2.0", "SCALE = 3.0")}, 75.0),
+)
 
 
 def own_metric(folder, capfd, code, command):
@@ -420,17 +435,22 @@ def test_an_evaluator_is_all_that_it_imports_and_reads(evaluator, capfd):
     assert own_metric(evaluator, capfd, run_command(command), command)[0] == 3.0
     (log,) = (evaluator / "run").glob("rollouts/*/*/*/*/rollout.asl")
     driven_ns = log.stat().st_mtime_ns
-    for name, (before, after, expected) in EDITS_OF_AN_EVALUATOR.items():
-        text = (evaluator / name).read_text()
-        (evaluator / name).write_text(text.replace(before, after))
-        if name.endswith(".py"):  # a process does not import a module twice
+    for edits, expected in EDITS_OF_AN_EVALUATOR:
+        files = {
+            scale_of(evaluator) if name == "scale" else evaluator / name: words
+            for name, words in edits.items()
+        }
+        for file, (before, after) in files.items():
+            file.write_text(file.read_text().replace(before, after))
+        if "scale" in edits:  # a process does not import a module twice
             words = [sys.executable, "-m", "alpasim_plugin.cli.main", *command]
             code = subprocess.run(words, check=False).returncode
         else:
             code = run_command(command)
         value, said = own_metric(evaluator, capfd, code, command)
         assert value == expected
-        assert f"1 rollout is scored again: {evaluator / name} was edited" in said
+        assert "1 rollout is scored again: " in said
+        assert [file for file in files if f"{file} was edited" not in said] == []
     assert log.stat().st_mtime_ns == driven_ns
 
 
@@ -451,6 +471,80 @@ def test_score_states_evaluators_and_says_which_was_edited(evaluator, tmp_path, 
     stated = parts | {name: replace(parts[name], digest="other", code={})}
     evaluators = resolve_evaluators(["mine.py:Mine"])
     changes = changed_evaluators(stated, evaluators)
-    assert f"{evaluator / 'scale_of_mine.py'} was not read before" in changes
+    assert f"{scale_of(evaluator)} was not read before" in changes
     assert changed_evaluators(parts, evaluators) == []
     assert changed_evaluators(parts, evaluators[:-1]) == ["evaluator mine.py:Mine is left out"]
+
+
+def test_each_setting_of_a_rollout_makes_another_rollout_and_of_scores_other_scores(monkeypatch):
+    usual = {"renderers": ("clean",), "policies": ("pure-pursuit",), "seeds": (0,)}
+
+    def cell(options=RunOptions(), overrides=(), **named):
+        plan = make_plan(expand("smoke/straight", overrides), **usual | named, options=options)
+        return plan.cells[0]
+
+    first = cell()
+    assert (cell().rollout_key, cell().score_key) == (first.rollout_key, first.score_key)
+    of_rollout = [
+        cell(renderers=("3dgs",)),
+        cell(renderers=("onefixer",)),
+        cell(renderers=("onefixer",), options=RunOptions(fixer=("references=0",))),
+        cell(renderers=("onefixer+clean",)),
+        cell(policies=("constant-velocity",)),
+        cell(seeds=(1,)),
+        cell(RunOptions(images="none")),
+        cell(RunOptions(controller="perfect")),
+        cell(overrides=("timing.duration_us=1200000",)),
+    ]
+    of_scores = [cell(RunOptions(preset="paper"))]
+    with monkeypatch.context() as patch:
+        patch.setattr(plan_of_runs, "require_device", lambda name: "cuda:0")
+        of_rollout.append(cell())
+    with monkeypatch.context() as patch:
+        patch.setattr(plan_of_runs, "package_digest", lambda: "edited")
+        of_rollout.append(cell())
+    assert len({first.rollout_key, *(one.rollout_key for one in of_rollout)}) == 12
+    assert {one.rollout_key for one in of_scores} == {first.rollout_key}
+    every = [first, *of_rollout, *of_scores]
+    assert len({one.score_key for one in every}) == len(every)
+
+
+def test_machine_code_is_named_by_compiler_and_processor(monkeypatch):
+    before = kernels.folder_of(kernels.__file__)
+    assert kernels.folder_of(kernels.__file__) == before
+    for home, name in (
+        (kernels.numba, "__version__"),
+        (kernels.binding, "get_host_cpu_name"),
+        (kernels, "sources_digest"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(home, name, "other" if name[0] == "_" else lambda *of: "other")
+            assert kernels.folder_of(kernels.__file__) != before
+
+
+def test_a_fit_is_named_by_its_recipe_and_by_simrun(scene, monkeypatch):
+    (scene / "scene.yaml").write_text(SCENE.replace(HILLS, ""))
+    scenario = load_scenario(scene / "scene.yaml")
+    recipe = recipe_of(scenario)
+    keys = [reconstruction_key(scenario, recipe)]
+    for field in fields(recipe):
+        other = replace(recipe, **{field.name: "other"})
+        keys.append(reconstruction_key(scenario, other))
+    monkeypatch.setattr(fits, "package_digest", lambda: "edited")
+    keys.append(reconstruction_key(scenario, recipe))
+    assert len(set(keys)) == len(keys)
+
+
+def test_an_import_by_another_simrun_is_no_finished_one(tmp_path, monkeypatch):
+    for name, content in (
+        (SCENARIO_FILE, {}),
+        (KEY_FILE, {"key": "k", "code": package_digest()}),
+        ("quality.json", {"psnr_db": 1.0}),
+    ):
+        (tmp_path / name).write_text(json.dumps(content))
+    assert finished(tmp_path, "k") == {"psnr_db": 1.0}
+    with pytest.raises(InputError, match="other files"):
+        finished(tmp_path, "other")
+    monkeypatch.setattr(imports, "package_digest", lambda: "edited")
+    with pytest.raises(InputError, match="another version of simrun"):
+        finished(tmp_path, "k")
