@@ -145,14 +145,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         raw_lanes = document["lane_segments"]
         raw_areas = document["drivable_areas"]
         raw_crossings = document["pedestrian_crossings"]
-        files.met += met_in("map", document)
-        for holder, things in (
-            ("lane_segment", raw_lanes),
-            ("drivable_area", raw_areas),
-            ("pedestrian_crossing", raw_crossings),
-        ):
-            for thing in things.values():
-                files.met += met_in(holder, thing)
+        files.met += _fields_of(document)
         if not raw_lanes or not raw_areas:
             raise ValueError("a map without lanes or without drivable areas")
         raw_marks = [
@@ -167,13 +160,10 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             _closed(_line(files, f"{path}, drivable area {key}", raw, "area_boundary", origin))
             for key, raw in raw_areas.items()
         )
-        crossings = []
-        for key, raw in raw_crossings.items():
-            location = f"{path}, crossing {key}"
-            first_edge, second_edge = (
-                _line(files, location, raw, edge, origin) for edge in ("edge1", "edge2")
-            )
-            crossings.append(_closed(np.concatenate([first_edge, second_edge[::-1]])))
+        crossings = tuple(
+            _crossing(files, f"{path}, crossing {key}", raw, origin)
+            for key, raw in raw_crossings.items()
+        )
         surface = merge_areas([shapely.Polygon(area[:, :2]) for area in areas])
     lane_map = LaneMap(
         {
@@ -186,7 +176,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         },
         road_edges=border_lines(surface, np.concatenate(areas)),
         drivable_areas=areas,
-        crosswalks=tuple(crossings),
+        crosswalks=crossings,
     )
     notes = [
         "road edges are the border of the union of the drivable areas; where the map is cut off, its border is an edge too"
@@ -197,6 +187,25 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
         for mark, count in sorted(strange.items())
     ]
     return lane_map, tuple(notes)
+
+
+def _fields_of(document: JsonObject) -> list[str]:
+    """Return the names of the fields of a map and of the things in it."""
+    names = [*met_in("map", document)]
+    for holder, layer in (
+        ("lane_segment", "lane_segments"),
+        ("drivable_area", "drivable_areas"),
+        ("pedestrian_crossing", "pedestrian_crossings"),
+    ):
+        for thing in document[layer].values():
+            names += met_in(holder, thing)
+    return names
+
+
+def _crossing(files: SourceFiles, location: str, raw: JsonObject, origin: F64) -> F64:
+    """Return the outline ``(N, 3)`` of a pedestrian crossing between its two edges."""
+    edges = [_line(files, location, raw, edge, origin) for edge in ("edge1", "edge2")]
+    return _closed(np.concatenate([edges[0], edges[1][::-1]]))
 
 
 def _lane(files: SourceFiles, path: Path, key: str, raw: JsonObject, origin: F64) -> Lane:

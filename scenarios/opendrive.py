@@ -428,17 +428,18 @@ def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequ
     outside = side[k + 1] if k + 1 < len(side) else None
     marks = {other.lane_id: other.mark for other in section.lanes}
     inner_mark = marks.get(inside.lane_id if inside is not None else 0)
-    beside_ids = [
-        lane_key(road, index, neighbour.lane_id)
-        if neighbour is not None and neighbour.kind in KINDS and neighbour.reversed == lane.reversed
-        else None
-        for neighbour in (inside, outside)
-    ]
+
+    def key_of(neighbour: OdrLane | None) -> str | None:
+        is_same_way = neighbour is not None and neighbour.reversed == lane.reversed
+        if neighbour is None or neighbour.kind not in KINDS or not is_same_way:
+            return None
+        return lane_key(road, index, neighbour.lane_id)
+
     # Seen in driving direction the middle of the road is on the left, with left-hand traffic on
     # the right.
     order = -1 if road.left_hand != lane.reversed else 1
     left_mark_type, right_mark_type = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
-    left_id, right_id = beside_ids[::order]
+    left_id, right_id = (key_of(inside), key_of(outside))[::order]
     turn = 1 if driven_along(road, lane) else -1
     left, right = (edge[::turn] for edge in borders[::order])
     limits = [mps for mps in limits_in(lane, road, section) if mps is not None]

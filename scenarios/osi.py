@@ -389,16 +389,9 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         if edge is None:
             return None
         sides.append((near(location, edge), _mark_type(lane_borders[0])))
-    pairing = facts.lane_pairing
-    ahead = [str(pair.successor_lane_id.value) for pair in pairing]
-    beside = [
-        str(ids[0].value) if ids else None
-        for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
-    ]
+    ahead, beside = _links(facts)
     if not facts.centerline_is_driving_direction:
         sides = [(edge[::-1], mark_type) for edge, mark_type in reversed(sides)]
-        ahead = [str(pair.antecessor_lane_id.value) for pair in pairing]
-        beside = beside[::-1]
     if not is_left_of(sides[0][0], sides[1][0]):
         sides = sides[::-1]
     (left, left_mark_type), (right, right_mark_type) = sides
@@ -416,6 +409,17 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         left_mark_type=left_mark_type,
         right_mark_type=right_mark_type,
     )
+
+
+def _links(facts: Any) -> tuple[list[str], list[str | None]]:
+    """Return the lanes that follow a lane in driving direction, and those on its left and right."""
+    beside = [
+        str(ids[0].value) if ids else None
+        for ids in (facts.left_adjacent_lane_id, facts.right_adjacent_lane_id)
+    ]
+    if facts.centerline_is_driving_direction:
+        return [str(pair.successor_lane_id.value) for pair in facts.lane_pairing], beside
+    return [str(pair.antecessor_lane_id.value) for pair in facts.lane_pairing], beside[::-1]
 
 
 def _edge(lane_borders: Sequence[Any], centre: F64, origin: F64) -> F64 | None:

@@ -22,7 +22,7 @@ Where it departs from OpenDRIVE:
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -129,11 +129,7 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
         *vehicle_notes,
         *USDZ.notes(files.met),
     ]
-    n_static = sum(actor.is_static for actor in actors)
-    if n_static:
-        notes.append(
-            f"{n_static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still"
-        )
+    notes += _static_notes(actors)
     return RecordedLog(
         scene_id=scene_id,
         source="usdz",
@@ -149,6 +145,14 @@ def read_usdz(path: str | Path, needs_map: bool = True) -> RecordedLog:
         first_frame_us=first_frame_us,
         alpasim_map=road.alpasim,
     )
+
+
+def _static_notes(actors: Sequence[Actor]) -> list[str]:
+    """Return a note on tracks that stand still, if any do."""
+    n_static = sum(actor.is_static for actor in actors)
+    if not n_static:
+        return []
+    return [f"{n_static} of {len(actors)} tracks are not marked CONTROLLABLE and stand still"]
 
 
 def _model_note(archive: Archive) -> str:

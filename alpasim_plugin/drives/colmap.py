@@ -242,22 +242,37 @@ def _rig_times(
     counts = Counter(rig for rig, _ in frames)
     largest = max(sorted(counts), key=lambda number: counts[number])
     reference = rigs[largest][0]
-    names = {one.number: one.name for one in images}
-    ordered = sorted(
-        (natural_order(names[taken[reference]]), list(taken.values()))
-        for rig, taken in frames
-        if rig == largest and taken.get(reference) in names
-    )
-    times_us = {
-        number: rank * PERIOD_US for rank, (_, taken) in enumerate(ordered) for number in taken
-    }
+    shots = [image_of for rig, image_of in frames if rig == largest]
+    times_us = _times_of_shots(shots, images, reference)
     notes = [f"a rig of {len(rigs[largest])} cameras: the images of a frame have one time"]
-    left_out = sum(one.number not in times_us for one in images)
+    left_out = sum(image.number not in times_us for image in images)
     if left_out:
         notes.append(
             f"{left_out} images of other rigs, or of frames without the reference camera, are left out"
         )
     return times_us, reference, notes
+
+
+def _times_of_shots(
+    shots: Sequence[Mapping[int, int]], images: Sequence[_Image], reference: int
+) -> dict[int, int]:
+    """Return the time of each image, microseconds, by its number.
+
+    Args:
+        shots: For each frame of the rig the number of a camera to that of its image; those without an
+            image of the reference camera have no time.
+        images: Images of the model.
+        reference: Number of the reference camera, the names of whose images order the frames.
+    """
+    names = {image.number: image.name for image in images}
+    ordered = sorted(
+        (natural_order(names[image_of[reference]]), list(image_of.values()))
+        for image_of in shots
+        if image_of.get(reference) in names
+    )
+    return {
+        number: rank * PERIOD_US for rank, (_, numbers) in enumerate(ordered) for number in numbers
+    }
 
 
 def _check_rigs(

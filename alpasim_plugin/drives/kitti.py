@@ -86,19 +86,18 @@ def read_kitti(folder: Path) -> SourceDrive:
     photographs = []
     for name, rows in _rows_of_poses(folder, files, len(poses)).items():
         K, T_left_camera = _camera(projections, name, folder / CALIBRATION)
-        spare = []
-        for i, path in zip(rows, files[name], strict=True):
-            if i >= len(poses):
-                spare.append(path.name)
-                continue
+        camera = "left" if name == left else "right"
+        numbered = list(zip(rows, files[name], strict=True))
+        posed = [(i, path) for i, path in numbered if i < len(poses)]
+        spare = [path.name for i, path in numbered if i >= len(poses)]
+        for i, path in posed:
             lens = Lens(*check_image(read_bytes(path), path), K)
             location = f"{folder}, photograph {i}"
-            camera = "left" if name == left else "right"
             pose = poses[i] @ T_left_camera
             photographs.append(PosedPhotograph(path, lens, pose, location, times[i], camera, {}))
         if spare:
             notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
-        alone = len(poses) - len(rows) + len(spare)
+        alone = len(poses) - len(posed)
         if alone:
             notes.append(f"{name}: {alone} of {len(poses)} poses have no photograph")
     others = [name for name in ROWS if name not in files and os.path.isdir(folder / name)]
