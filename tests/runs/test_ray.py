@@ -55,7 +55,7 @@ def test_a_rollout_that_kills_its_workers_is_lost_alone(tmp_path, cluster):
     cells = plan.cells
     results = ray_backend.run_on_ray(plan, cells, tmp_path, Executor("ray"), 2, None)
     by_policy = {cell.policy.name: result for cell, result in results}
-    assert by_policy["constant-velocity"]["status"] == "ok"
+    assert by_policy["constant-velocity"].status == "ok"
     assert "3 workers died" in by_policy[KILLER].reason
 
 
@@ -81,7 +81,7 @@ def test_a_node_that_differs_drives_nothing(tmp_path):
     assert isinstance(refused, InfrastructureError)
     driven = ray_backend.drive_on_node(job, scenario, names, expected)
     assert isinstance(driven, ray_backend.DrivenRollout)
-    assert ray_backend.write_rollout(driven, tmp_path)["status"] == "ok"
+    assert ray_backend.write_rollout(driven, tmp_path).status == "ok"
     assert (tmp_path / plan.cells[0].folder / "rollout.asl").is_file()
 
 
