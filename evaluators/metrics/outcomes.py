@@ -23,7 +23,6 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.motion import time_to_collision_s
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import (
-    BEHIND_END,
     DIRECTION_M,
     followed,
     on_route,
@@ -208,7 +207,8 @@ AFTER_S = 3.0  # what has been a cause excuses for so long
 
 def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give ``stalled``, ``braked_without_cause``, ``left_route`` and ``ended_in_danger`` per step;
-    nothing by AlpaSim's presets, whose metrics are AlpaSim's.
+    nothing by AlpaSim's presets, whose metrics are AlpaSim's. Both of the first compare with the
+    recording, and are no event of a step behind its end.
     """
     if preset.aliases:
         return []
@@ -227,11 +227,12 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     has_side = np.isfinite(on.lateral_m)
     why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, path, line, s)
-    is_measured = has_side & ~on.is_beyond
-    unknown = why if not has_side.all() else BEHIND_END
+    # Behind the end of the recording nothing drove on with which a slow ego could be compared.
+    stalled &= ~on.is_beyond
+    braked &= ~on.is_beyond
     return [
-        series("stalled", t_us, stalled, is_measured, unknown),
-        series("braked_without_cause", t_us, braked, is_measured, unknown),
+        series("stalled", t_us, stalled, has_side, why),
+        series("braked_without_cause", t_us, braked, has_side, why),
         series("left_route", t_us, np.nan_to_num(on.lateral_m) >= LEFT_ROUTE_M, has_side, why),
         series("ended_in_danger", t_us, _in_danger(rollout, scene, preset)),
     ]

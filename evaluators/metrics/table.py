@@ -406,14 +406,14 @@ METRICS = MetricTable(
             "`time_to_collision_s` is below 2 s",
         ),
         "stalled": _flag(
-            "the ego stands although nothing is in its way and the recording drove on",
+            "the ego stands although nothing is in its way and the recording drove on; not behind the recording's end",
             label="stalled rollouts",
             reference=CENTRE,
             invalid=_SHORT,
             formula="[stalled and braked without a cause](report.md#how-a-rollout-ends)",
         ),
         "braked_without_cause": _flag(
-            "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way",
+            "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way; not behind the recording's end",
             label="rollouts that braked without a cause",
             reference=CENTRE,
             invalid=_SHORT,

@@ -134,6 +134,20 @@ def test_standing_at_the_end_of_the_path_is_no_stall():
     assert fired(track(x), track(x)) == set()
 
 
+def test_a_slow_ego_behind_the_end_of_the_recording_is_no_event_and_has_a_value():
+    """The road goes on there; a policy that came farther than the recording is still compared."""
+    half = len(T) // 2
+    recorded = track((V * T)[:half])
+    past_the_end = np.where(T[half] + 1.0 > T, V, np.maximum(V - 3.0 * (T - T[half] - 1.0), 0.0))
+    log, scene = drive(track(travelled(past_the_end)), recorded)
+    road = np.array([[V * T[half] + s, 0.0, 0.0] for s in np.arange(1.0, 80.0)])
+    series = evaluate_outcomes(log, replace(scene, path_beyond=road), PRESETS["strict"])
+    values = {one.name: one for one in series}
+    for name in ("stalled", "braked_without_cause"):
+        assert values[name].valid.all()
+        assert not values[name].value.any()
+
+
 @pytest.mark.parametrize(("aside_m", "left"), [(3.9, False), (4.1, True)])
 def test_the_route_is_left_at_four_metres(aside_m, left):
     assert ("left_route" in fired(track(V * T, aside_m))) == left

@@ -170,7 +170,7 @@ def test_a_warm_up_shorter_than_the_first_block_is_refused(straight_road):
 def test_a_fixer_that_breaks_its_contract_is_named(straight_road, mode, fixer):
     with pytest.raises(FixerError) as caught:
         drive(straight_road, fixer=fixer, mode=mode)
-    assert caught.value.failure_class == "fixer"
+    assert caught.value.failure_class == "fixer fault"
     assert fixer.__name__ in caught.value.message
 
 
