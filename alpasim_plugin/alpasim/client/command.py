@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import grpc
+
 from alpasim_plugin.alpasim.client.channel import Address
 from alpasim_plugin.alpasim.client.child import Child, exit_reason
 from alpasim_plugin.alpasim.client.driver import OPTIONS, DriverPolicy, cameras_sent
@@ -27,6 +29,7 @@ from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
 from alpasim_plugin.core.queries import options_of
 from alpasim_plugin.core.subprocesses import say
 from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.log.wire.services import is_lost_connection
 
 MAX_PATH = 100  # of a socket file; the system's own limit is 104 (macOS) or 108 (Linux)
 LOOPBACK = "127.0.0.1"
@@ -297,4 +300,12 @@ class CommandPolicy(DriverPolicy):
             self._served.require_running(0.0 if isinstance(error, PolicyError) else REAP_S)
             if "DEADLINE_EXCEEDED" in error.message:  # it hangs: the next rollout gets a new one
                 self._served.stop()
+            cause = error.__cause__
+            if isinstance(cause, grpc.RpcError) and is_lost_connection(cause):
+                # Both ends are on this machine: nothing but the command can have closed its end.
+                self._served.stop()
+                raise PolicyError(
+                    f"exec:{self._served.command.text}: it closed the connection, and still runs",
+                    "see output.log of the rollout",
+                ) from error
             raise
