@@ -75,6 +75,16 @@ def same_threads():
         torch.set_num_threads(before)
 
 
+@pytest.fixture(autouse=True)
+def same_import_path():
+    """Leave the import path as it was: what a worker on a cluster does to its own, a test that calls
+    it here would do to all tests after it.
+    """
+    before = list(sys.path)
+    yield
+    sys.path[:] = before
+
+
 @pytest.fixture(scope="session")
 def shared_data():
     """Give the data folder or skip: its files have licences that keep them out of this

@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from alpasim_plugin.cli.main import run_command
 
 
+@pytest.mark.slow
 def test_a_part_of_the_users_own_drives_again_only_if_it_is_named_too(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     base = "from policies.simple import ConstantVelocity\n\n\n"

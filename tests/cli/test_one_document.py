@@ -46,11 +46,21 @@ RUN = [*DRIVE, "--workers", "1", "--no-report", "--images", "none", "--out", "ru
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        ([*DRIVE, "--dry-run", "--json"], "rollouts"),
         ([*RUN, "-qj"], "summary"),
-        (["check", "policy", "loud.py:Loud", "--json"], "checks"),
-        (["check", "renderer", "loud.py:Grey", "--scenario", "scene.yaml", "-j"], "renderer"),
-        ([*DRIVE[:2], "--policy", "loud.py:Absent", "scene.yaml", "--json"], "error"),
+        pytest.param([*DRIVE, "--dry-run", "--json"], "rollouts", marks=pytest.mark.slow),
+        pytest.param(
+            ["check", "policy", "loud.py:Loud", "--json"], "checks", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            ["check", "renderer", "loud.py:Grey", "--scenario", "scene.yaml", "-j"],
+            "renderer",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            [*DRIVE[:2], "--policy", "loud.py:Absent", "scene.yaml", "--json"],
+            "error",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_part_and_its_children_write_to_standard_error(tmp_path, words, key):

@@ -155,11 +155,11 @@ def test_events_come_in_order_of_time_with_the_place_of_the_ego():
     assert (times["hard_brake"], times["collision_rear"]) == (brakes_us, hit_us)
     assert list(times.values()) == sorted(times.values())
     placed = placed_events(log, reduction)
-    keys = [(event["t_us"], event["metric"]) for event in placed]
+    keys = [(event.t_us, event.metric) for event in placed]
     assert keys == sorted(keys)
     backwards = replace(reduction, events=reduction.events[::-1])
     assert placed_events(log, backwards) == placed
     for event in placed:
-        at = log.ego.xyz[log.ego.t_us == event["t_us"]][0]
-        assert (event["x_m"], event["y_m"]) == pytest.approx(at[:2], abs=1e-3)
-        assert event["t_s"] == pytest.approx((event["t_us"] - 300_000) * 1e-6)
+        at = log.ego.xyz[log.ego.t_us == event.t_us][0]
+        assert (event.x_m, event.y_m) == pytest.approx(at[:2], abs=1e-3)
+        assert event.t_s == pytest.approx((event.t_us - 300_000) * 1e-6)

@@ -161,7 +161,8 @@ def test_bad_devices_are_refused():
 COMPILE = Path(__file__).parents[2] / "docs" / "scripts" / "compile_gpu_kernels.py"
 
 
-@pytest.mark.parametrize("capability", first_of([90, 80]))
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", [90, 80])
 def test_kernels_compile_without_spilling(capability):
     environment = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
     done = subprocess.run(

@@ -110,6 +110,7 @@ def test_one_variant_alone_is_decided_by_its_own_test(tmp_path, two_changes):
     assert entry.difference == "worse"
 
 
+@pytest.mark.slow
 def test_variants_that_are_alike_are_called_different_on_few_pages():
     """Two renderers beside a baseline, all alike, and 20 metrics of twelve scenes."""
     names = [PRIMARY, "offroad", "collision_any", "stalled", "left_route"]

@@ -97,6 +97,7 @@ def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
     assert [row["copied_from"] is not None for row in rows] == [False, True] * 2
 
 
+@pytest.mark.slow
 def test_copies_are_reused_and_a_lost_or_outdated_one_is_made_again(tmp_path):
     plan = plan_of()
     drive(plan, tmp_path)

@@ -429,6 +429,7 @@ def own_metric(folder, capfd, code, command):
     return read_json(manifest)["metrics"]["mine_m"]["value"], said
 
 
+@pytest.mark.slow
 def test_an_evaluator_is_all_that_it_imports_and_reads(evaluator, capfd):
     command = ["--renderer", "clean", "--policy", "constant-velocity", *WORDS]
     command += ["--evaluator", "mine.py:Mine", "--out", "run", "scene.yaml"]

@@ -154,6 +154,7 @@ timing: {duration_us: 6000000}
 """
 
 
+@pytest.mark.slow
 def test_alpasims_preset_drives_on_and_only_what_passed_the_end_is_driven_again(tmp_path):
     (tmp_path / "road.yaml").write_text(ROAD)
 

@@ -36,6 +36,7 @@ def test_a_scene_that_two_arguments_name_is_in_one_shard_of_four(folder, capsys)
     assert sorted(name.rpartition("-")[2] for name in scenes) == ["a", "b", "c", "d", "e"]
 
 
+QUICK = ("through a link", "a suite")
 SPELLINGS = {
     "beside": "b.yaml",
     "with a dot": "./b.yaml",
@@ -47,7 +48,13 @@ SPELLINGS = {
 }
 
 
-@pytest.mark.parametrize("spelling", SPELLINGS.values(), ids=SPELLINGS)
+@pytest.mark.parametrize(
+    "spelling",
+    [
+        pytest.param(text, id=name, marks=[] if name in QUICK else pytest.mark.slow)
+        for name, text in SPELLINGS.items()
+    ],
+)
 def test_a_scene_is_in_one_shard_however_it_is_spelled(folder, spelling):
     place = spelling.format(folder=folder) if "version" not in spelling else "suite.yaml"
     (folder / "suite.yaml").write_text(spelling)
