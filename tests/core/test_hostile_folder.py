@@ -121,7 +121,13 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("threads", [1, 2], ids=["forked from a server", "spawned"])
+@pytest.mark.parametrize(
+    "threads",
+    [
+        pytest.param(1, id="forked from a server"),
+        pytest.param(2, id="spawned", marks=pytest.mark.slow),
+    ],
+)
 def test_no_process_that_a_pool_of_workers_starts_imports_from_the_working_directory(
     hostile, threads
 ):

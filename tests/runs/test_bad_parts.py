@@ -16,7 +16,6 @@ from tests.runs.bad_parts import FAULTS, HARMLESS
 FILE = Path(__file__).with_name("bad_parts.py")
 SHORT = ("--set", "timing.duration_us=900000", "--set", "timing.warmup_us=200000", "--no-report")
 LIMIT_S = 45
-QUICK = ("leave", "interrupt", "end_process", "crash", "close_files", "fork", "patch_library")
 CLASSES = {"policy": "policy", "renderer": "renderer fault", "fixer": "fixer fault"}
 HANGING = {"sleep", "spin"}
 
@@ -65,11 +64,8 @@ def check(folder, manifests, key, kind, faults):
         assert manifest["status"] == "failed" or fault in HARMLESS, fault
 
 
-FAST = pytest.param(("leave", "end_process", "patch_library"), id="quick")
-ALL = pytest.param(tuple(FAULTS), id="all", marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("faults", [FAST, ALL])
+@pytest.mark.slow
+@pytest.mark.parametrize("faults", [tuple(FAULTS)], ids=["all"])
 def test_a_bad_policy_is_named_and_ends_no_other_rollout(tmp_path, alone, faults):
     code, manifests = drive(
         tmp_path, ["constant-velocity", *bad("policy", faults)], ("clean",), 2, *limit(faults)
@@ -82,9 +78,8 @@ def test_a_bad_policy_is_named_and_ends_no_other_rollout(tmp_path, alone, faults
 
 
 @pytest.mark.parametrize("kind", ["renderer", "fixer"])
-@pytest.mark.parametrize(
-    "faults", [pytest.param(QUICK[:4], id="quick", marks=pytest.mark.slow), ALL]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("faults", [tuple(FAULTS)], ids=["all"])
 def test_a_bad_renderer_or_fixer_is_named_and_ends_no_other_rollout(tmp_path, alone, kind, faults):
     watcher = f"{FILE}:Watcher"
     renderers = ["clean", *bad(kind, faults)]
@@ -95,17 +90,8 @@ def test_a_bad_renderer_or_fixer_is_named_and_ends_no_other_rollout(tmp_path, al
     assert code == 2
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        QUICK[0],
-        *(
-            pytest.param(one, marks=pytest.mark.slow)
-            for one in FAULTS
-            if one not in (QUICK[0], *HANGING)
-        ),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [name for name in FAULTS if name not in HANGING])
 def test_a_bad_evaluator_is_named_and_keeps_the_logs(tmp_path, alone, fault):
     more = ("--evaluator", f"{FILE}:evaluator_{fault}")
     code, (manifest,) = drive(tmp_path, ["constant-velocity"], ("clean",), 1, *more)

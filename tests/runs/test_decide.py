@@ -150,6 +150,7 @@ def test_a_failed_rollout_ends_the_decision(tmp_path):
     assert "rollouts failed" in decided.record()["stopped"]
 
 
+@pytest.mark.slow
 def test_the_command_line_decides_and_says_so_in_its_exit_code(tmp_path, capsys):
     words = ["--renderer", f"{GREY},{DARKER}", "--policy", BY_GREY, "--images", "none"]
     words += ["--until-decided", "--metric", "offroad=0.6", "--no-report", "--workers", "1"]

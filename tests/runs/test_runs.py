@@ -193,6 +193,7 @@ def test_workers_times_threads_never_exceed_the_cores():
             assert wanted is not None or budget.workers * budget.per_worker <= max(cores, 1)
 
 
+@pytest.mark.slow
 def test_what_two_suites_list_is_driven_once_and_another_scenario_of_its_id_is_refused():
     refs = [*expand("suites/smoke"), *expand("suites/hard")]  # both list hard/hard_brake
     plan = make_plan(refs, ("clean",), ("log-replay",), (0,), RunOptions())
