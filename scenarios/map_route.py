@@ -1,6 +1,7 @@
 """Ways along the lanes of a map: the shortest one between two places, or one that is drawn."""
 
 import heapq
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -53,8 +54,18 @@ class LaneGraph:
         return tuple(key for key in self.lanes[lane_id].successors if key in self.lanes)
 
     def driven_m(self, way: Way) -> float:
-        """Return the length of a way without lane changes, up to its goal."""
-        return sum(self.length_m[key] for key in way.lane_ids) - way.start_m - way.beyond_m
+        """Return the length of a way up to its goal; a lane that one changes from lies beside the
+        next one.
+        """
+        return sum(self._driven_lengths_m(way)) - way.start_m - way.beyond_m
+
+    def _driven_lengths_m(self, way: Way) -> list[float]:
+        """Return what each lane of a way adds to its length."""
+        after = (*way.lane_ids[1:], "")
+        return [
+            0.0 if then in self.beside(key) else self.length_m[key]
+            for key, then in zip(way.lane_ids, after, strict=True)
+        ]
 
     def beside(self, lane_id: str) -> tuple[str, ...]:
         """Return the neighbours of a lane into which one may change."""
@@ -109,7 +120,8 @@ class LaneGraph:
 
     def through(self, places: Sequence[Sequence[Spot]]) -> list[Way]:
         """Return the shortest way to each spot of the last place that passes the others in order;
-        none to a spot that no such way leads to.
+        none to a spot that no such way leads to. A way drives no lane twice, and changes lanes once
+        at a time.
 
         Args:
             places: At least two, each with one spot for each of its lanes.
@@ -119,16 +131,25 @@ class LaneGraph:
         for goals in places[1:]:
             reached = []
             for goal in goals:
+                further = [self.between([begin], [goal]) for begin in begins]
                 longer = [
-                    _joined(way, further)
-                    for way, begin in zip(ways, begins, strict=True)
-                    if (further := self.between([begin], [goal])) is not None
+                    _joined(way, part)
+                    for way, part in zip(ways, further, strict=True)
+                    if part is not None
                 ]
+                longer = [way for way in longer if self._can_be_driven(way)]
                 if longer:
                     reached.append((min(longer, key=self.driven_m), goal))
             ways = [way for way, _ in reached]
             begins = [goal for _, goal in reached]
         return ways
+
+    def _can_be_driven(self, way: Way) -> bool:
+        """Return whether a way takes each lane once, and no two changes of lanes follow at once."""
+        ids = way.lane_ids
+        changes = [then in self.beside(key) for key, then in itertools.pairwise(ids)]
+        in_a_row = any(first and second for first, second in itertools.pairwise(changes))
+        return len(set(ids)) == len(ids) and not in_a_row
 
     def drawn(self, way: Way, length_m: float, rng: np.random.Generator) -> Way:
         """Return a way carried on from its end to a length, at each fork into a drawn lane that it
@@ -183,13 +204,7 @@ class LaneGraph:
 
     def limits_mps(self, way: Way, line: Path) -> F64:
         """Return the speed limit at each vertex of a way's line; infinite where none is known."""
-        after = (*way.lane_ids[1:], "")
-        # A lane that one changes from lies beside the next one.
-        lengths = [
-            0.0 if then in self.beside(key) else self.length_m[key]
-            for key, then in zip(way.lane_ids, after, strict=True)
-        ]
-        ends_m = np.cumsum(lengths) - way.start_m
+        ends_m = np.cumsum(self._driven_lengths_m(way)) - way.start_m
         limits = [self.lanes[key].speed_limit_mps or np.inf for key in way.lane_ids]
         return np.array(limits)[np.searchsorted(ends_m[:-1], line.s)]
 

@@ -1,5 +1,7 @@
 """Ways along lanes: through places, by length, and none that passes a lane twice."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,14 +48,37 @@ def test_a_way_passes_the_places_between_its_ends():
     (around,) = graph.through([start, [Spot("long", 30.0)], goal])
     assert around.lane_ids == ("in", "long", "out")
     assert (around.start_m, around.beyond_m) == (20.0, pytest.approx(40.0))
-    assert graph.through([start, [Spot("short", 30.0)], [Spot("long", 5.0)]])[0].lane_ids == (
-        "in",
-        "short",
-        "out",
-        "back",
-        "in",
-        "long",
+    # Both ways of the block are driven only by taking the first lane twice.
+    assert graph.through([start, [Spot("short", 30.0)], [Spot("long", 5.0)]]) == []
+
+
+def lanes_side_by_side():
+    """Three lanes from left to right, of which the right one goes on."""
+    left, middle, right = (
+        straight_lane(name, (0, y), (300, y), ("ahead",) if name == "right" else ())
+        for name, y in (("left", 7.0), ("middle", 3.5), ("right", 0.0))
     )
+    lanes = (
+        replace(left, right_neighbour="middle"),
+        replace(middle, left_neighbour="left", right_neighbour="right"),
+        replace(right, left_neighbour="middle"),
+        straight_lane("ahead", (300, 0), (600, 0), ()),
+    )
+    return LaneGraph({one.lane_id: one for one in lanes})
+
+
+def test_a_change_of_lanes_adds_no_length_and_two_follow_one_another_nowhere():
+    graph = lanes_side_by_side()
+    (way,) = graph.through([[Spot("middle", 10.0)], [Spot("right", 200.0)]])
+    assert way.lane_ids == ("middle", "right")
+    assert graph.driven_m(way) == pytest.approx(190.0)
+    farther = graph.drawn(way, 400.0, np.random.default_rng(0))
+    assert farther.lane_ids == ("middle", "right", "ahead")
+    assert graph.driven_m(farther) == pytest.approx(400.0)
+    line = graph.line(farther)
+    assert line.length_m - farther.beyond_m == pytest.approx(400.0, abs=1.0)
+    twice = [[Spot("left", 10.0)], [Spot("middle", 120.0)], [Spot("ahead", 100.0)]]
+    assert graph.through(twice) == []
 
 
 def test_a_drawn_way_has_the_length_wanted_and_drives_no_lane_twice():
