@@ -115,8 +115,8 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
         return (), (
             f"no calibration of {FRONT_WIDE} in this scene: the default front camera is used",
         )
-    archive.files.met += met_in_sensor(sensor)
     with parsing(f"{archive.path}, {FRONT_WIDE}", GIVE):
+        archive.files.met += met_in_sensor(sensor)
         camera = front_camera(np.array(_lens_numbers(sensor["properties"])[0]), mount(sensor))
     return (camera,), (
         "rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",

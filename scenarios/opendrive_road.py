@@ -508,16 +508,20 @@ def _geometry(record: Element, location: str, road_m: float) -> Geometry:
 def _closed_to_cars(lane: Element) -> bool:
     """Return whether the access rules of a lane keep cars out, on a part of it or all along.
 
-    Where a rule allows some, all others are kept out; a rule that does not say what it does
-    restricts those that it names.
+    Where the rules from one place on allow some, all others are kept out there; a rule that does not
+    say what it does restricts those that it names.
     """
-    allowed: set[str] = set()
-    denied: set[str] = set()
+    allowed: dict[str, set[str]] = {}
+    denied: dict[str, set[str]] = {}
     for access in lane.findall("access"):
+        begin = access.get("sOffset", "0")
         names = {access.get("restriction", "")}
         names |= {part.get("type", "") for part in access.findall("restriction")}
-        (allowed if access.get("rule") == "allow" else denied).update(names - {""})
-    return bool(denied & CARS) or bool(allowed and not allowed & CARS)
+        by_begin = allowed if access.get("rule") == "allow" else denied
+        by_begin.setdefault(begin, set()).update(names - {""})
+    are_denied = any(names & CARS for names in denied.values())
+    are_left_out = any(names and not names & CARS for names in allowed.values())
+    return are_denied or are_left_out
 
 
 def _section(element: Element, start_m: float, end_m: float) -> Section:

@@ -179,6 +179,10 @@ def trajectory_bytes(trajectories: Sequence[Trajectory], name: str) -> list[byte
     xyz = np.concatenate([trajectory.xyz for trajectory in trajectories])
     quat = np.concatenate([trajectory.quat for trajectory in trajectories])
     t_us = np.concatenate([trajectory.t_us for trajectory in trajectories])
+    if len(t_us) and t_us.min() < 0:
+        raise InputError(
+            f"{name}: a time of {t_us.min()} us", "a log's times are counted from zero upwards"
+        )
     lengths = [len(trajectory) for trajectory in trajectories]
     return packed_trajectories(xyz, _checked_quats(xyz, quat, name), t_us, lengths)
 

@@ -40,7 +40,7 @@ def _by_id(refs: Iterable[ScenarioRef]) -> dict[str, ScenarioRef]:
     """
     by_id: dict[str, ScenarioRef] = {}
     for ref in refs:
-        is_archive = ref.path.endswith(".usdz")
+        is_archive = ref.path.endswith(".usdz") and ref.seed is None
         scene_id = usdz_scene_id(Path(ref.path)) if is_archive else scene_id_of(ref)
         other = by_id.setdefault(scene_id, ref)
         if other != ref and _content(other) != _content(ref):

@@ -240,11 +240,11 @@ def read_logs(run: Run, cell: WatchedCell) -> Logs:
 
 def _read_log(run: Run, rollout: Rollout) -> RolloutLog | SimrunError | None:
     path = run.file_of(rollout, LOG_NAME)
-    if path is None:
-        # As it was named to simrun score, so from the same working directory.
-        stated = _scored_log(run, rollout)
-        path = None if stated is None else Path(stated)
     try:
+        if path is None:
+            # As it was named to simrun score, so from the same working directory.
+            stated = _scored_log(run, rollout)
+            path = None if stated is None else Path(stated)
         return read_log(path) if path is not None and os.path.isfile(path) else None
     except SimrunError as error:
         return error  # the page says so in this rollout's place; the others are still shown

@@ -23,6 +23,7 @@ from alpasim_plugin.log.run_folder.sides import (
     Row,
     Side,
     by_renderer,
+    flat_row,
     metric_names,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
@@ -100,6 +101,7 @@ def paired(
     Raises:
         InputError: No row has the baseline.
     """
+    rows = [flat_row(row) for row in rows]
     sides = by_renderer(rows)
     if baseline not in sides:
         raise InputError(

@@ -18,6 +18,7 @@ from alpasim_plugin.log.run_folder.sides import (
     Row,
     Side,
     by_renderer,
+    flat_row,
     metric_names,
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
@@ -52,7 +53,8 @@ def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> MeanTable:
     Returns:
         RENDERER -> METRIC -> mean.
     """
-    return aggregate_sides(by_renderer(rows), metric_names(rows), known)
+    flat_rows = [flat_row(row) for row in rows]
+    return aggregate_sides(by_renderer(flat_rows), metric_names(flat_rows), known)
 
 
 def aggregate_sides(

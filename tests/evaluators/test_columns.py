@@ -177,3 +177,25 @@ def test_a_table_without_its_keys_is_refused_by_name(tmp_path):
     pq.write_table(pa.table({"renderer": ["clean"]}), tmp_path / "rollouts.parquet")
     with pytest.raises(InputError, match="no column 'policy'"):
         RolloutTable.of_files([tmp_path / "rollouts.parquet"])
+
+
+@pytest.mark.parametrize("flag", [bool, np.bool_, float])
+def test_rows_of_a_caller_may_be_flat_or_nested_and_hold_flags_of_any_kind(flag):
+    cells = [("a", 0, True), ("a", 1, False), ("b", 0, False), ("b", 1, False)]
+    keys = {"policy": "p", "scene": "s", "status": "ok"}
+    flat = [
+        {**keys, "renderer": renderer, "seed": seed, "offroad": flag(value), "offroad_valid": True}
+        for renderer, seed, value in cells
+    ]
+    nested = [
+        {
+            **keys,
+            "renderer": renderer,
+            "seed": seed,
+            "metrics": {"offroad": {"value": flag(value), "valid": True, "reason": ""}},
+        }
+        for renderer, seed, value in cells
+    ]
+    for rows in (flat, nested):
+        assert aggregate(rows)["a"]["offroad"].mean == pytest.approx(0.5)
+        assert paired(rows, "b")["a"]["offroad"].n_cells == 2

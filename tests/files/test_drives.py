@@ -204,6 +204,20 @@ def test_focal_lengths_by_angles_of_view(tmp_path, keys, focal):
     assert (K[0, 0], K[1, 1]) == pytest.approx(focal)
 
 
+@pytest.mark.parametrize(
+    "keys",
+    [{"polygon": [[1, 2], [3]]}, {"camera_angle_x": "wide"}, {"camera_angle_x": 0}, {"x_fov": {}}],
+)
+def test_keys_that_change_nothing_refuse_no_drive(tmp_path, keys):
+    folder = transforms(tmp_path, NAMES)
+    with edited(folder) as document:
+        document.update(keys)
+    plain = read_source(transforms(tmp_path / "plain", NAMES), need_files=False)
+    read = read_source(folder, need_files=False)
+    assert len(read.photographs) == len(plain.photographs)
+    assert "inf" not in str(read.notes)
+
+
 def test_masks_of_frames_are_noted_since_they_are_not_used(tmp_path):
     folder = transforms(tmp_path, [f"{i}.png" for i in range(6)])
     with edited(folder) as document:

@@ -214,6 +214,11 @@ NESTED = '<access sOffset="0" rule="deny"><restriction type="passengerCar"/></ac
     [
         ('<access sOffset="0" rule="allow" restriction="trucks"/>', "bus"),
         ('<access sOffset="0" rule="allow" restriction="emergency"/>', "bus"),
+        (
+            '<access sOffset="0" rule="allow" restriction="bus"/>'
+            '<access sOffset="5" rule="allow" restriction="passengerCar"/>',
+            "bus",
+        ),
         ('<access sOffset="10" rule="deny" restriction="passengerCar"/>', "bus"),
         (NESTED, "bus"),
         ('<access sOffset="0" rule="allow" restriction="passengerCar"/>', "vehicle"),

@@ -68,3 +68,10 @@ def test_one_pose_has_the_numbers_of_many():
         T = rigid(rotation, [1.5, -2.5, 1e4])
         many = wire_poses(T[None, :3, 3], quat_from_matrix(T[None, :3, :3]), "poses")
         assert wire_pose(T, "a pose") == many[0]
+
+
+def test_a_time_before_zero_is_refused():
+    one = trajectory(3)
+    early = Trajectory(np.array([-5, 0, 3], dtype=np.int64), one.xyz, one.quat)
+    with pytest.raises(InputError, match="-5 us"):
+        trajectory_bytes([early], "a plan")

@@ -108,7 +108,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 def _aside(folder: Path) -> Path:
     """Return where a folder lies while a new one takes its name."""
-    return folder.with_name(f".{folder.name}.old")
+    return folder.with_name(f".{folder.name}.simrun-aside")
 
 
 def restore_folder(folder: Path) -> None:

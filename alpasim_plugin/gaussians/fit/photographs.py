@@ -181,8 +181,13 @@ def read_posed_photographs(
     )
     listed = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
     frames = [{**document, **frame} for frame in listed]
-    stated = ((key, value) for frame in frames for key, value in frame.items())
-    met = [field_name("frame", key) for key, value in stated if np.any(value)]
+    shared = {key: value for key, value in document.items() if key != "frames"}
+    met = [
+        field_name("frame", key)
+        for part in (shared, *listed)
+        for key, value in part.items()
+        if _is_set(value)
+    ]
     TRANSFORMS.check(met, path, "write the poses as they are, without this key")
     meant = document.get("axes", axes)
     if not isinstance(meant, str) or meant not in AXES:
@@ -311,6 +316,13 @@ def _focal_lengths(frame: Mapping[str, Any], width: int, height: int) -> tuple[f
     return lengths.get("x", lengths.get("y", np.nan)), lengths.get("y", lengths.get("x", np.nan))
 
 
+def _is_set(value: Any) -> bool:
+    """Return whether a value of the file differs from nothing: zero, false, or lists of these."""
+    if isinstance(value, list):
+        return any(_is_set(part) for part in value)
+    return bool(value)
+
+
 def angle_notes(photographs: Sequence[PosedPhotograph]) -> tuple[str, ...]:
     """Return a note where a file states a focal length and an angle of view that disagree."""
     unlike = []
@@ -319,8 +331,8 @@ def angle_notes(photographs: Sequence[PosedPhotograph]) -> tuple[str, ...]:
         for axis, size, used in (("x", lens.width, lens.K[0, 0]), ("y", lens.height, lens.K[1, 1])):
             for key, unit in ((f"camera_angle_{axis}", 1.0), (f"{axis}_fov", np.pi / 180)):
                 stated = photograph.more.get(key)
-                if stated is None:
-                    continue
+                if not isinstance(stated, (int, float)) or not 0 < unit * stated < np.pi:
+                    continue  # what is no angle of view was not used either
                 by_angle = 0.5 * size / np.tan(0.5 * unit * float(stated))
                 if abs(by_angle - used) > SAME_FOCAL * used:
                     unlike.append(f"{used:.1f} px is used, {key} says {by_angle:.1f} px")

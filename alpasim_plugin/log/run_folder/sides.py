@@ -66,7 +66,11 @@ class RolloutValues:
         A caller's row may leave out METRIC_valid, where the value is valid, and may say why it is
         not in METRIC_reason.
         """
-        names = [name for name, value in row.items() if value is None or isinstance(value, Real)]
+        names = [
+            name
+            for name, value in row.items()
+            if value is None or isinstance(value, (Real, np.bool_))
+        ]
         reasons = {name: row.get(f"{name}_reason") for name in names}
         return cls(
             cell=(str(row["policy"]), str(row["scene"]), int(row["seed"])),
@@ -192,6 +196,19 @@ class Side:
         if not self.ok[row]:
             return f"failed ({self.failure(row)})"
         return f"not valid ({self.reason(row, metric)})"
+
+
+def flat_row(row: Row) -> Row:
+    """Return a row as ``rollouts.parquet`` has it, of one whose values lie under ``metrics``."""
+    nested = row.get("metrics")
+    if not isinstance(nested, Mapping):
+        return row
+    flat = {key: value for key, value in row.items() if key != "metrics"}
+    for name, entry in nested.items():
+        flat[name] = entry["value"]
+        flat[name + VALID] = entry.get("valid", True)
+        flat[f"{name}_reason"] = entry.get("reason", "")
+    return flat
 
 
 def by_renderer(rows: Sequence[Row]) -> dict[str, Side]:

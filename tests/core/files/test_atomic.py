@@ -177,4 +177,15 @@ def test_a_process_killed_between_the_two_renames_leaves_the_old_folder_to_the_n
     with atomic_folder(folder) as partial:
         (partial / "x").write_text("newer")
     assert (folder / "x").read_text() == "newer"
-    assert not folder.with_name(".a.old").exists()
+    assert not folder.with_name(".a.simrun-aside").exists()
+
+
+def test_a_folder_of_a_user_with_a_name_like_a_temporary_one_is_left_alone(tmp_path):
+    for name in (".a.old", ".a.tmp"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.txt").write_text("mine")
+    with atomic_folder(tmp_path / "a") as partial:
+        (partial / "x").write_text("new")
+    for name in (".a.old", ".a.tmp"):
+        assert (tmp_path / name / "mine.txt").read_text() == "mine"
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["x"]
