@@ -32,7 +32,7 @@ def _shares(groups: Path, own_groups: Path) -> Iterator[float]:
         is_second_version = controllers == ""
         if not is_second_version and CONTROLLER not in controllers.split(","):
             continue
-        root = groups if is_second_version else groups / controllers
+        root = groups if is_second_version else _mounted(groups, controllers)
         inner = root / place.lstrip("/")
         # Within a container the path may be that of the host, and the root is the container's own.
         folders = [root, *(folder for folder in (inner, *inner.parents) if root in folder.parents)]
@@ -40,6 +40,14 @@ def _shares(groups: Path, own_groups: Path) -> Iterator[float]:
             words = _words(folder, is_second_version)
             if len(words) == 2 and words[0].isdigit() and words[1].isdigit():
                 yield int(words[0]) / max(int(words[1]), 1)
+
+
+def _mounted(groups: Path, controllers: str) -> Path:
+    """Return the folder of controllers that share a hierarchy, whose order in its name may differ."""
+    names = controllers.split(",")
+    spellings = (controllers, ",".join(reversed(names)), CONTROLLER)
+    folders = [groups / spelling for spelling in spellings]
+    return next((folder for folder in folders if folder.is_dir()), folders[0])
 
 
 def _words(folder: Path, is_second_version: bool) -> list[str]:

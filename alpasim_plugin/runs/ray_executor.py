@@ -220,7 +220,13 @@ def drive_on_node(
         )
     cell: Cell
     options: RunOptions
-    cell, options, threads, limit_s = pickle.loads(job)
+    try:
+        cell, options, threads, limit_s = pickle.loads(job)
+    except Exception as error:  # whatever a module of the user's raises when it is imported here
+        return InfrastructureError(
+            f"node {name} cannot read the rollout: {type(error).__name__}: {error}",
+            "install the same packages on all nodes",
+        )
     try:
         with tempfile.TemporaryDirectory(prefix="simrun-rollout-") as scratch:
             root = Path(scratch)

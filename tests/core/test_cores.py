@@ -41,6 +41,14 @@ def machine(tmp_path, monkeypatch):
             },
             2,
         ),
+        (  # the kernel names the two in another order than the folder does
+            "4:cpuacct,cpu:/box\n",
+            {
+                "cpu,cpuacct/box/cpu.cfs_quota_us": "200000\n",
+                "cpu,cpuacct/box/cpu.cfs_period_us": "100000\n",
+            },
+            2,
+        ),
         (
             "4:cpu:/\n",
             {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"},
