@@ -34,6 +34,7 @@ from alpasim_plugin.log.run_folder.schema import (
     cell_name,
 )
 from evaluators.metrics.outcomes import (
+    ENDED,
     OUTCOMES,
     SHORT_OF_END,
     ending_of,
@@ -183,6 +184,9 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     ]
     made_up = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
     sentences += [f"{made_up}."] if made_up else []
+    ended = None if manifest is None else manifest.ended
+    if rollout.ok and ended in ENDED:
+        sentences.append(f"The rollout ended since {ENDED[ended]}.")
     return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log)
 
 

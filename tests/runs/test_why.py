@@ -190,6 +190,7 @@ def test_a_drive_that_ended_short_says_so_and_that_its_plans_stand(tmp_path, cap
     found = json.loads(capsys.readouterr().out)
     assert found["outcome"] == SHORT_OF_END
     assert any("before the end stands" in line for line in found["found"])
+    assert found["found"][-1] == "The rollout ended since its time was up."
 
 
 @pytest.mark.slow
