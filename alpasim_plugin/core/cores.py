@@ -47,7 +47,7 @@ def _mounted(groups: Path, controllers: str) -> Path:
     names = controllers.split(",")
     spellings = (controllers, ",".join(reversed(names)), CONTROLLER)
     folders = [groups / spelling for spelling in spellings]
-    return next((folder for folder in folders if folder.is_dir()), folders[0])
+    return next((folder for folder in folders if os.path.isdir(folder)), folders[0])
 
 
 def _words(folder: Path, is_second_version: bool) -> list[str]:

@@ -205,6 +205,7 @@ def test_wheel_and_pedals_do_what_they_say():
     env.close()
 
 
+@pytest.mark.slow
 def test_what_makes_no_environment_is_refused():
     for settings in (
         {"camera": "left"},

@@ -283,6 +283,7 @@ def turned_aside(name, yaw):
     return replace(spec, name=name, T_rig_camera=T)
 
 
+@pytest.mark.slow
 def test_the_model_does_not_depend_on_the_order_in_which_cameras_are_listed(tmp_path):
     damaged = replace(FITTED, share=0.05, pose_error_m=0.05)
     rig = [turned_aside("front", 0.0), turned_aside("left", 1.2), turned_aside("rear", np.pi)]

@@ -76,6 +76,7 @@ def decided_run(tmp_path_factory):
     return root, *decide(root, SAME, plan_of())
 
 
+@pytest.mark.slow
 def test_a_question_is_decided_before_all_scenes_are_driven(decided_run):
     root, decided, announced = decided_run
     assert (decided.outcome.exit_code, decided.record()["verdict"]) == (0, "non-inferior")
@@ -95,6 +96,7 @@ def test_the_order_depends_on_the_names_alone():
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp_path):
     before = read_decision(decided_run[0])
     root = tmp_path / "again"
@@ -110,11 +112,13 @@ def test_an_interrupted_decision_continues_and_decides_the_same(decided_run, tmp
     assert decided.record() == before
 
 
+@pytest.mark.slow
 def test_another_question_in_the_same_folder_is_refused(decided_run):
     with pytest.raises(InputError):
         decide(decided_run[0], CLOSER, plan_of())
 
 
+@pytest.mark.slow
 def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_run, capsys):
     root = str(decided_run[0])
     assert run_command(["check", "run", root]) == 0
@@ -127,6 +131,7 @@ def test_other_commands_read_the_run_and_the_report_shows_the_decision(decided_r
     assert 'class="chart"' in page
 
 
+@pytest.mark.slow
 def test_a_damaged_record_is_refused(decided_run, tmp_path):
     text = (decided_run[0] / DECISION).read_text()
     (tmp_path / DECISION).write_text(text[: len(text) // 2])

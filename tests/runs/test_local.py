@@ -40,6 +40,7 @@ def work(item):
     return item.upper()
 
 
+@pytest.mark.slow
 def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_path):
     once = f"dies once {tmp_path / 'seen'}"
     found = dict(run_jobs(work, ["a", "dies", "b", "leaves", once, "c", "d"], 2))

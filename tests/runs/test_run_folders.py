@@ -131,6 +131,7 @@ SCENE = "scenes/smoke-straight.json"
 OF_THE_RUN = ("run.json", "rollouts.parquet", "steps.parquet", "summary.json", "summary.md", SCENE)
 
 
+@pytest.mark.slow
 def test_every_file_of_the_run_is_verified_and_written_again(made, root, capsys):
     for file in (*OF_THE_RUN, "junit.xml", "files.json"):
         (lengthen if file != "files.json" else remove)(root / file)

@@ -57,6 +57,7 @@ def test_the_same_command_reuses_every_finished_rollout_and_runs_the_rest(tmp_pa
     assert comparable(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_a_folder_with_another_run_is_refused_unless_resumed(tmp_path):
     run(cheap_plan(), tmp_path)
     with pytest.raises(InputError):

@@ -164,6 +164,7 @@ def test_a_run_stands_for_its_worst_failure_and_no_name_for_the_newest_run(
     assert "Right" not in shown[0]
 
 
+@pytest.mark.slow
 def test_a_rollout_that_broke_off_shows_its_error(tmp_path, capsys):
     (tmp_path / "bend.yaml").write_text(BEND)
     both = tuple(f"{HERE}:{name}" for name in ("Raises", "RaisesLater"))
