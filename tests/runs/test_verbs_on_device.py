@@ -62,7 +62,7 @@ def import_drive(folder, monkeypatch):
     [
         # Of each drive the first frame is fetched once more: to see whether it shows the road.
         pytest.param(run, 5 + 1, 2000, 1.0, marks=pytest.mark.slow),
-        pytest.param(fork, 8 + 2, 2000, 1.0, marks=pytest.mark.slow),
+        pytest.param(fork, 8 + 2, 2000, 2.0, marks=pytest.mark.slow),
         (refine, FRAMES, 1000, 0.1),
         # Beside its updates: a checkpoint, and the model at the end.
         pytest.param(import_drive, FRAMES + 30, 6000, 1.0, marks=pytest.mark.slow),
