@@ -17,7 +17,7 @@ from policies.road_vision import PaintPoints
 
 OFFSET, HEADING, CURVATURE, BEND, WIDTH = range(5)
 MEAN_WIDTH_M = 3.5
-# Of the histograms of paint over the lateral position.
+# Histograms of lane-marking pixels over the lateral position.
 HALF_M = 7.0
 CELL_M = 0.1
 CELLS = round(2 * HALF_M / CELL_M)

@@ -116,7 +116,6 @@ def _mean(side: Side, metric: MetricInfo) -> Mean:
 
 
 # The policy drove there, but what happened does not count.
-CUT_RULES = ("steps_after_event", "steps_after_drift")
 COUNTS = (  # of `Censoring`, which add up over runs
     "rollouts",
     "steps_total",

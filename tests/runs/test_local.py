@@ -51,9 +51,9 @@ def test_every_item_has_a_result_and_what_lost_its_worker_runs_once_more(tmp_pat
 
 @pytest.mark.slow
 def test_an_item_that_hangs_is_ended_at_the_limit_and_the_others_are_not():
-    found = dict(run_jobs(work, ["hangs", "a"], 1, limit_s=0.5))
+    found = dict(run_jobs(work, ["hangs", "a"], 1, limit_s=10.0))
     assert found["a"] == "A"
-    assert "within 0.5 s" in found["hangs"].reason
+    assert "within 10 s" in found["hangs"].reason
 
 
 @pytest.mark.slow
@@ -61,9 +61,9 @@ def test_an_item_whose_worker_is_stopped_is_ended_at_the_limit(
     monkeypatch,
 ):
     monkeypatch.setattr(local, "OVERTIME_S", 1.0)
-    found = dict(run_jobs(work, ["stops", "a"], 2, limit_s=2.0))
+    found = dict(run_jobs(work, ["stops", "a"], 2, limit_s=10.0))
     assert found["a"] == "A"
-    assert "within 2 s" in found["stops"].reason
+    assert "within 10 s" in found["stops"].reason
 
 
 @pytest.mark.parametrize("threads", first_of([2, 1]))

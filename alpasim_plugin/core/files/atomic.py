@@ -80,14 +80,14 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
     block raises.
 
-    A folder cannot be renamed onto another one: the old one is moved aside first. Where the process
-    is killed between the two, `restore_folder` brings it back.
+    A folder cannot be renamed onto an existing one: the existing one is renamed to a backup first.
+    Where the process is killed between the two renames, `restore_folder` brings the backup back.
 
     Raises:
         InfrastructureError: The disk refuses.
     """
     partial = temporary_path(folder)
-    old = _aside(folder)
+    old = _backup_of(folder)
     try:
         restore_folder(folder)
         partial.mkdir(parents=True)
@@ -106,16 +106,16 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _aside(folder: Path) -> Path:
-    """Return where a folder lies while a new one takes its name."""
-    return folder.with_name(f".{folder.name}.simrun-aside")
+def _backup_of(folder: Path) -> Path:
+    """Return the name of the backup of a folder that is being replaced."""
+    return folder.with_name(f".{folder.name}.simrun-backup")
 
 
 def restore_folder(folder: Path) -> None:
-    """Bring back a folder that `atomic_folder` had moved aside when its process was killed; whoever
+    """Bring back the backup that `atomic_folder` had made when its process was killed; whoever
     looks for a folder that is written so calls this first.
     """
-    old = _aside(folder)
+    old = _backup_of(folder)
     if os.path.exists(old) and not os.path.exists(folder):
         old.replace(folder)
 

@@ -371,9 +371,9 @@ class Manifest:
         ended: By what it ended: ``time``, or the kind of the path's end.
         stage_ms: Stage of the loop -> milliseconds of each pass.
         session_uuid: Id of the log.
-        fixer: What the fixer says of itself and of its counts; empty without one.
+        fixer: The fixer's label, mode and counters of frames; empty without one.
         has_camera: The policy has a camera.
-        renderer_facts, policy_facts: What these parts say of themselves.
+        renderer_facts, policy_facts: Facts that these parts report, by name.
         metrics: METRIC -> value.
         events: Outcomes, by time.
         contacts: Beginnings of contacts, by time, where the preset searches between steps.

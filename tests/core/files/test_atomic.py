@@ -177,7 +177,7 @@ def test_a_process_killed_between_the_two_renames_leaves_the_old_folder_to_the_n
     with atomic_folder(folder) as partial:
         (partial / "x").write_text("newer")
     assert (folder / "x").read_text() == "newer"
-    assert not folder.with_name(".a.simrun-aside").exists()
+    assert not folder.with_name(".a.simrun-backup").exists()
 
 
 def test_a_folder_of_a_user_with_a_name_like_a_temporary_one_is_left_alone(tmp_path):

@@ -108,5 +108,5 @@ def test_an_entry_that_was_moved_aside_when_its_maker_was_killed_is_read_again(o
         (folder / "text").write_text("good 3")
 
     cached("texts", "k", make, read, "a text")
-    (own_cache / "texts" / "k").rename(own_cache / "texts" / ".k.simrun-aside")
+    (own_cache / "texts" / "k").rename(own_cache / "texts" / ".k.simrun-backup")
     assert cached("texts", "k", pytest.fail, read, "a text") == "good 3"
