@@ -14,7 +14,6 @@ from alpasim_plugin.core.types import Bool
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
 
-# One photograph of so many is held out; of those that were not taken along a road, which are fewer.
 # One photograph of so many is held out.
 EVERY = 8
 # The same for a drive in which no road was found below the path.

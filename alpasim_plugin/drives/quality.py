@@ -13,9 +13,9 @@ import numpy as np
 
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
-from alpasim_plugin.core.geometry import inverse, shifted
+from alpasim_plugin.core.geometry import inverse, left_of, shifted, unit
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
-from alpasim_plugin.core.types import F32
+from alpasim_plugin.core.types import F32, F64
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
@@ -27,6 +27,7 @@ from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 LATERAL_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
 OPAQUE = 0.5
+STANDING_M = 0.1  # from one photograph to the next but one
 EXAMPLES = 3  # photographs of each use on the page
 COVERED = 8  # views that measure coverage
 IMAGES = "images"
@@ -64,7 +65,14 @@ def measure(
             rows[use] = [compared(view) for view in chosen]
     sample_views = [views["fitted"][i] for i in _spread(len(views["fitted"]), COVERED)]
     coverage = {
-        lateral_m: float(np.mean([_covered(graph, view, lateral_m) for view in sample_views]))
+        lateral_m: float(
+            np.mean(
+                [
+                    _covered(graph, view, lateral_m * _left_of_path(views["fitted"], view))
+                    for view in sample_views
+                ]
+            )
+        )
         for lateral_m in LATERAL_M
     }
     return rows, coverage
@@ -82,12 +90,27 @@ def _spread(count: int, most: int) -> list[int]:
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
 
 
-def _covered(graph: SceneGraph, view: PosedView, lateral_m: float) -> float:
-    """Return the share of the image's lower half that the model covers, seen from beside where a
-    view was taken.
+def _left_of_path(views: Sequence[PosedView], view: PosedView) -> F64:
+    """Return the unit direction ``(3,)``, world, to the left of the way that a view's camera went;
+    of one that stood, the camera's own left.
     """
+    centres = [
+        other.camera.centre_world for other in views if other.camera_name == view.camera_name
+    ]
+    away = [float(np.linalg.norm(centre - view.camera.centre_world)) for centre in centres]
+    i = int(np.argmin(away))
+    way = centres[min(i + 1, len(centres) - 1)] - centres[max(i - 1, 0)]
+    if np.hypot(*way[:2]) < STANDING_M:
+        return np.asarray(-inverse(view.camera.T_camera_world)[:3, 0], dtype=np.float64)
+    return np.array([*left_of(unit(way[:2])), 0.0])
+
+
+def _covered(graph: SceneGraph, view: PosedView, offset: F64) -> float:
+    """Return the share of the image's lower half that the model covers, seen from an offset
+    ``(3,)``, metres, world, of where a view was taken.
+    """
+    shift = shifted(*offset)
     pose = inverse(view.camera.T_camera_world)
-    shift = shifted(*-lateral_m * pose[:3, 0])  # the camera's own left
     camera = replace(view.camera, T_camera_world=inverse(shift @ pose))
     return float((graph.render(camera, {}).alpha[camera.height // 2 :] > OPAQUE).mean())
 

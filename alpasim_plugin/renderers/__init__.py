@@ -29,4 +29,4 @@ def make_renderer(
     renderer: Renderer = build(
         unidentified("renderer", name), scenario=scenario, seed=seed, device=device, threads=threads
     )
-    return in_weather(renderer, scenario, seed)
+    return in_weather(renderer, scenario, seed, device, threads)

@@ -1,4 +1,5 @@
-"""Weather and light between a renderer and what follows, by the depth of a frame.
+"""Weather and light between a renderer and what follows, by the depth of what a camera looks at: of
+a built scene that of the scene, behind every renderer alike, of a recorded drive that of its frames.
 
 An image of the clear day is taken for what surfaces reflect of a light of 1, in linear light. Night
 and a low sun put another light there, rain wets the ground, and lamps shine
@@ -17,11 +18,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.renderers.built_depth import BuiltDepth
+from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
 from alpasim_plugin.renderers.snow import ALBEDO, SnowCover
@@ -72,12 +76,21 @@ class WeatherRenderer(Renderer):
         base: Its frames need depth.
         scenario: Its ``environment``, and what shines there.
         seed: The rollout's, of the drops.
+        device: Where the depth of a built scene is drawn.
+        threads: Of the CPU rasteriser; None leaves their number.
 
     Raises:
         RendererError: A frame without depth.
     """
 
-    def __init__(self, base: Renderer, scenario: Scenario, seed: int) -> None:
+    def __init__(
+        self,
+        base: Renderer,
+        scenario: Scenario,
+        seed: int,
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         self.base, self.scenario, self.seed = base, scenario, seed
         self.lookahead = base.lookahead
         self.block = base.block
@@ -91,6 +104,9 @@ class WeatherRenderer(Renderer):
         self.extinction = KOSCHMIEDER / (scenario.environment.fog_visibility_m or np.inf)
         self.extinction += sum(kind.extinction(rate) for kind, rate in self.falling)
         self.snow = SnowCover(scenario) if scenario.environment.snow else None
+        # The depth of `clean` is that of the scene as built.
+        has_own_depth = scenario.model is not None or isinstance(base, CleanRenderer)
+        self.built = None if has_own_depth else BuiltDepth(scenario, device, threads)
 
     @property
     def stage_ms(self) -> Mapping[str, float]:  # type: ignore[override]  # that of the base
@@ -122,37 +138,49 @@ class WeatherRenderer(Renderer):
                 f"weather over {type(self.base).__name__}: its frame has no depth",
                 "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
             )
-        image = (frame.rgb, frame.depth)
-        camera = request.camera
+        rgb, camera = frame.rgb, request.camera
+        depth = frame.depth if self.built is None else self.built.of_request(request)
+        # Of a rolling shutter the middle row's, so that no row is off by more than half of it.
+        T_world_camera, actors = request.T_world_camera[-1], request.actors
+        if request.exposure is not None:
+            T_world_camera, actors = at_share(request, 0.5)
         taken = RecordedFrame(
-            request.t_us,
-            camera.name,
-            camera.K,
-            request.T_world_camera[-1],
-            request.actors,
-            lambda: image,
+            request.t_us, camera.name, camera.K, T_world_camera, actors, lambda: (rgb, depth)
         )
-        T_world_rig = request.T_world_camera[-1] @ inverse(camera.T_rig_camera)
-        return replace(frame, rgb=self._read(taken, T_world_rig)[0])
+        T_world_rig = T_world_camera @ inverse(camera.T_rig_camera)
+        return replace(frame, rgb=self._in_weather(rgb, depth, taken, T_world_rig))
 
     def _recorded(self, frame: RecordedFrame) -> tuple[U8, F32]:
-        """Return a recorded image in this weather, and its depth; the ego is where its camera's
-        mount says, and where the log says for a camera that the scenario does not mount.
+        """Return a recorded image in this weather, and its depth as the renderer sees it; the ego is
+        where its camera's mount says, and where the log says for a camera that the scenario does
+        not mount.
         """
-        for camera in self.scenario.cameras:
-            if camera.name == frame.camera:
-                return self._read(frame, frame.T_world_camera @ inverse(camera.T_rig_camera))
+        mounts = {camera.name: camera.T_rig_camera for camera in self.scenario.cameras}
         log = self.scenario.ego_log
-        within_us = np.clip(frame.t_us, log.t_us[0], log.t_us[-1])
-        return self._read(frame, interpolate(log, within_us))
+        T_world_rig = (
+            frame.T_world_camera @ inverse(mounts[frame.camera])
+            if frame.camera in mounts
+            else interpolate(log, np.clip(frame.t_us, log.t_us[0], log.t_us[-1]))
+        )
+        rgb, seen_depth = frame.read()
+        depth = seen_depth
+        if self.built is not None:
+            depth = self.built.of_recorded(frame, *seen_depth.shape)
+        return self._in_weather(rgb, depth, frame, T_world_rig), seen_depth
 
-    def _read(self, frame: RecordedFrame, T_world_rig: F64) -> tuple[U8, F32]:
-        """Return an image in this weather, and its depth, with the ego at a pose ``(4, 4)``.
+    def _in_weather(self, rgb: U8, depth: F32, frame: RecordedFrame, T_world_rig: F64) -> U8:
+        """Return an image in this weather, with the ego at a pose ``(4, 4)``.
 
         Surfaces get their colours, then the light that falls on them, then what lies between them
         and the camera, each effect on what the ones before it made.
+
+        Args:
+            rgb: ``(H, W, 3)`` sRGB of the clear day.
+            depth: ``(H, W)`` metres along the optical axis of what the camera looks at, 0 in the
+                sky.
+            frame: When, from where and beside whom it was taken.
+            T_world_rig: Of the ego.
         """
-        rgb, depth = frame.read()
         view = self._view(frame, depth)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
@@ -167,7 +195,7 @@ class WeatherRenderer(Renderer):
             light += glow
         self._veil(light, view)
         self._draw_falling(light, illumination, frame, depth.shape[:2])
-        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)], depth
+        return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)]
 
     def _view(self, frame: RecordedFrame, depth: F32) -> View:
         """Return what stands where in an image, road users among it."""
@@ -253,9 +281,15 @@ def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:
     return cv2.GaussianBlur(colours, (0, 0), GLOW_WIDTHS * light.shape[1]) * np.float32(GLOW_SHARE)
 
 
-def in_weather(renderer: Renderer, scenario: Scenario, seed: int) -> Renderer:
+def in_weather(
+    renderer: Renderer,
+    scenario: Scenario,
+    seed: int,
+    device: str = "cpu",
+    threads: int | None = None,
+) -> Renderer:
     """Return a renderer in the weather of a scene; itself where nothing of it is seen."""
-    weather_renderer = WeatherRenderer(renderer, scenario, seed)
+    weather_renderer = WeatherRenderer(renderer, scenario, seed, device, threads)
     return (
         renderer
         if weather_renderer.is_clear and not weather_renderer.lights.signals

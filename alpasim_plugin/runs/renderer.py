@@ -47,7 +47,7 @@ def make_renderer(
     built: Renderer = build(spec.base, scenario=pinhole_scenario, **session)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
 
-    base = in_weather(built, pinhole_scenario, seed)
+    base = in_weather(built, pinhole_scenario, seed, device, threads)
     if spec.fixer is None:
         has_lens = any(camera.lens is not None for camera in scenario.cameras)
         return LensRenderer(base, cover) if has_lens else base

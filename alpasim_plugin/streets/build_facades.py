@@ -32,6 +32,7 @@ WIDTH_M = (9.0, 19.0)
 DEPTH_M = 9.0
 CLEAR_M = 2.8  # no wall stands nearer to the road
 LIT_SHARE = 0.3  # of windows at night
+SUNK_M = 0.2  # of a wall below the lowest ground at its foot
 # Cells per bay and floor, and the cell size at which the level is chosen. Each level is the average
 # of the first.
 CELLS = ((12, 0.25), (6, 0.32), (3, 0.9), (1, 2.6))
@@ -159,7 +160,9 @@ def lit_windows(site: Site, houses: Houses) -> tuple[float, F64, F64]:
     house, u, v = grid_cells(bays, floors)
     is_lit = (site.rng("lit-windows").random(len(house)) < LIT_SHARE) & (v * floors[house] > 1)
     house, u, v = house[is_lit], u[is_lit, None], v[is_lit]
-    middle = site.world(start[house] + u * (end - start)[house], v * houses.height_m[house])
+    middle = site.world(start[house] + u * (end - start)[house])
+    base = np.minimum(site.world(start)[:, 2], site.world(end)[:, 2])  # as that of the walls
+    middle[:, 2] = base[house] - SUNK_M + v * (houses.height_m + SUNK_M)[house]
     facing = -site.frame.turned(houses.away[house])
     return BAY_M / 4, middle + 0.05 * facing, facing
 
@@ -258,11 +261,11 @@ def _covered(
     length = np.linalg.norm(ends - starts, axis=1)
     wall, u, v = grid_cells(across, up)
     plan = starts[wall] + u[:, None] * (ends - starts)[wall]
-    z = base[wall] - 0.2 + v * (height[wall] + 0.2)
+    z = base[wall] - SUNK_M + v * (height[wall] + SUNK_M)
     scales = (
         SPREAD * (length / across)[wall],
         np.full(len(wall), 0.05),
-        SPREAD * ((height + 0.2) / up)[wall],
+        SPREAD * ((height + SUNK_M) / up)[wall],
     )
     means = np.column_stack([site.frame.to_world(plan), z])
     quats = _facing(site, starts, ends)[wall]

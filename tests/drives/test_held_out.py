@@ -142,3 +142,33 @@ def test_a_held_out_photograph_is_compared_in_the_exposure_of_its_own_camera(mon
     quality.measure(empty, views, exposures, lambda stage, done, total: None)
     assert np.allclose(compared["front-000004"], 1.0)
     assert np.allclose(compared["left-000004"], 0.5)
+
+
+def test_coverage_is_measured_beside_the_path_whatever_way_a_camera_looks(monkeypatch):
+    """The left camera's own left is behind it on the path."""
+    offsets = {}
+    monkeypatch.setattr(
+        quality,
+        "_covered",
+        lambda graph, view, offset: offsets.setdefault((view.camera_name, *offset), 1.0),
+    )
+    views = []
+    for camera, turn in (("front", 0.0), ("left", np.pi / 2)):
+        for i in range(4):
+            pose = Street(bow_m=0.0).pose(2.0 * i)
+            pose[:3, :3] = se2(0, 0, turn)[:3, :3] @ pose[:3, :3]
+            image = np.zeros((16, 32, 3), np.uint8)
+            views.append(
+                PosedView(PinholeCamera.from_pose(32, 16, K, pose), image, f"{camera}-{i}")
+            )
+    empty = Reconstruction(
+        cloud_from_points(np.zeros((3, 3)), np.zeros((3, 3))),
+        {},
+        Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)),
+    )
+    quality.measure(
+        empty, {"fitted": views, "held-out": [], "never-fitted": []}, {}, lambda *stage: None
+    )
+    assert {key[0] for key in offsets} == {"front", "left"}
+    assert all(key[1:] == pytest.approx((0.0, key[2], 0.0), abs=1e-9) for key in offsets)
+    assert {round(key[2], 6) for key in offsets} == {0.0, 1.0, -1.0, 2.0, -2.0}

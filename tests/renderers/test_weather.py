@@ -7,15 +7,26 @@ import pytest
 
 from alpasim_plugin import load_scenario, make_renderer
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import Actor, Box, Frame, Lane, RecordedFrame, Signal, Trajectory
+from alpasim_plugin.core.types import (
+    Actor,
+    Box,
+    Exposure,
+    Frame,
+    Lane,
+    RecordedFrame,
+    Signal,
+    Trajectory,
+)
 from alpasim_plugin.renderers import weather
-from alpasim_plugin.renderers.gaussian import clear_cache
+from alpasim_plugin.renderers.gaussian import CleanRenderer, clear_cache
 from alpasim_plugin.renderers.lights import STREET_CD, SceneLights, Spot, drawn
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
 from alpasim_plugin.renderers.snow import ALBEDO, BESIDE, LANE, TRACK, SnowCover
 from alpasim_plugin.renderers.view import view_of
 from alpasim_plugin.renderers.weather import WeatherRenderer, in_weather
 from alpasim_plugin.runs.gpu_check import frame_request
+from alpasim_plugin.streets.build_facades import Houses, lit_windows
+from alpasim_plugin.streets.site import make_site
 from alpasim_plugin.world.ground import flat
 from tests.camera_builders import ahead
 from tests.examples import first_of
@@ -80,7 +91,9 @@ def shown(scenario, depth, rgb=GREY, actors=None, t_us=0, pose=AHEAD):
     one = RecordedFrame(t_us, "front", K, pose, actors or {}, lambda: (rgb, depth))
     base = Flat()
     base.recorded = lambda: [one]
-    return WeatherRenderer(base, scenario, 0).recorded()[0].read()[0]
+    renderer = WeatherRenderer(base, scenario, 0)
+    renderer.built = None  # the depth is the frame's, as that of a recorded drive is
+    return renderer.recorded()[0].read()[0]
 
 
 @pytest.mark.parametrize(
@@ -210,6 +223,55 @@ def test_snow_lies_by_the_map_and_not_on_road_users():
     assert shown(scenario, wall, np.zeros_like(GREY), poses)[40, 50].max() < 20
 
 
+class WrongDepth:
+    """Shows what `clean` shows, as if all of it were 4 m away: a reconstruction at its worst."""
+
+    lookahead = 0
+    block = None
+    has_history = False
+
+    def __init__(self, scenario):
+        self.clean = CleanRenderer(scenario, 0, "cpu", None)
+
+    def render(self, request):
+        frame = self.clean.render(request)
+        return replace(frame, depth=np.full_like(frame.depth, 4.0))
+
+    def recorded(self):
+        request = frame_request(self.clean.scenario, 256, 144)
+        frame = self.render(request)
+        pose = request.T_world_camera[1]
+        image = frame.rgb, frame.depth
+        seen = request.t_us, "front", request.camera.K, pose, request.actors, lambda: image
+        return [RecordedFrame(*seen)]
+
+
+@pytest.mark.parametrize("setting", ["time=night", "snow=2", "fog_visibility_m=100"])
+def test_lamps_snow_and_air_are_where_the_scene_is_behind_every_renderer(setting):
+    scenario = load_scenario("smoke/lead_car", overrides=[f"environment.{setting}"])
+    request = frame_request(scenario, 256, 144)
+    wrong = WrongDepth(scenario)
+    due = WeatherRenderer(wrong.clean, scenario, 0).render(request).rgb
+    over = WeatherRenderer(wrong, scenario, 0)
+    assert np.array_equal(over.render(request).rgb, due)
+    recorded, depth = over.recorded()[0].read()
+    assert np.array_equal(recorded, due)
+    assert (depth == 4.0).all()  # the fixer's warps need what the renderer sees
+
+
+def test_lit_windows_lie_in_the_floors_of_walls_on_a_slope():
+    scenario = load_scenario("smoke/straight", overrides=["environment.time=night"])
+    site = make_site(scenario, lambda xy: 0.1 * np.asarray(xy)[:, 0])
+    house = Houses(
+        np.array([[[0.0, 12.0], [18.0, 12.0]]]), np.array([[0.0, 1.0]]), np.array([12.4])
+    )
+    _, middles, _ = lit_windows(site, house)
+    base = site.world(house.front[0])[:, 2].min() - 0.2
+    floor = (middles[:, 2] - base) / (12.6 / 4) - 0.5
+    assert len(floor) > 3
+    assert np.allclose(floor, np.round(floor), atol=1e-6)
+
+
 def test_a_street_lamp_lights_by_cosine_over_the_square_of_the_distance():
     scenario = scene("time=night")
     lamps = SceneLights(scenario)
@@ -284,6 +346,25 @@ def test_beams_start_at_the_ego_of_the_request_whatever_its_camera_is_called(nam
 
     WeatherRenderer(Wall(), scenario, 0).render(asked)
     assert np.allclose(rigs[0], T_world_rig)
+
+
+def test_weather_of_a_rolling_shutter_is_seen_from_its_middle(monkeypatch):
+    """The car turns while the shutter is open; lamps lie where the middle row shows them."""
+    scenario = scene("time=night", "poles_spacing_m=0", "buildings=0")
+    asked = frame_request(scenario, 32, 18)
+    start, end = np.eye(4), np.eye(4)
+    start[:3, 3] = 2.0, 0.0, 0.0
+    poses = np.stack([start @ asked.T_world_camera[1], end @ asked.T_world_camera[1]])
+    exposure = Exposure(np.linspace(0, 1, 18, dtype=np.float32)[:, None], {})
+    asked = replace(asked, T_world_camera=poses, actors={}, exposure=exposure)
+    places = []
+    monkeypatch.setattr(
+        WeatherRenderer,
+        "_in_weather",
+        lambda self, rgb, depth, frame, rig: places.append(frame.T_world_camera[:3, 3]) or rgb,
+    )
+    WeatherRenderer(WrongDepth(scenario), scenario, 0).render(asked)
+    np.testing.assert_allclose(places[0], poses.mean(axis=0)[:3, 3], atol=1e-9)
 
 
 @pytest.mark.parametrize(("heading_x", "is_red"), [(1.0, True), (-1.0, False)])

@@ -224,7 +224,7 @@ class SceneCache:
             built = complete(
                 build(self._spec.base, scenario=pinhole_scenario, **self._session), Renderer
             )
-            renderer = in_weather(built, pinhole_scenario, self._session["seed"])
+            renderer = in_weather(built, pinhole_scenario, **self._session)
             settings = self._spec.fixer and self._spec.fixer.settings
             reads_device = isinstance(settings, PixelFixerSettings)
             if isinstance(settings, FixerSettings):
