@@ -230,12 +230,18 @@ class WeatherRenderer(Renderer):
     def _mirror_lamps(
         self, light: F32, view: View, spots: Sequence[Spot], T_world_rig: F64
     ) -> None:
-        """Mirror sky and lamps in a wet ground, smeared upright by its ripples, in place."""
+        """Mirror the sky, and lamps that nothing hides, in a wet ground, smeared upright by its
+        ripples, in place.
+        """
         if not self.scenario.environment.rain:
             return
         flip = np.array([1.0, 1.0, -1.0])
         ground_twice = np.array([0.0, 0.0, 2 * T_world_rig[2, 3]])
-        below = [replace(spot, middle=spot.middle * flip + ground_twice) for spot in spots]
+        below = [
+            replace(spot, middle=spot.middle * flip + ground_twice)
+            for spot in spots
+            if not _is_hidden(spot, view)
+        ]
         lamps, _ = drawn(below, view)
         smeared = cv2.GaussianBlur(lamps, (0, 0), sigmaX=0.6, sigmaY=SMEAR_HEIGHTS * len(lamps))
         share = view.ground * mirrored_share(-view.rays[..., 2])
@@ -272,10 +278,27 @@ class WeatherRenderer(Renderer):
             light += covered[..., None] * (DAY_AIR_RGB * illumination - light)
 
 
+def _is_hidden(spot: Spot, view: View) -> bool:
+    """Return whether something stands before a spot's middle, as far as it lies in the image."""
+    local = (spot.middle - view.place) @ view.T_world_camera[:3, :3]
+    if local[2] <= 0:
+        return False
+    column, row = np.floor((view.K @ local / local[2])[:2]).astype(np.int64).tolist()
+    height, width = view.depth_m.shape
+    if not (0 <= row < height and 0 <= column < width):
+        return False
+    return bool(local[2] >= _farthest_m(view.depth_m[row, column]))
+
+
+def _farthest_m(depth_m: F32) -> F32:
+    """Return how far along the optical axis a lamp is still before a surface, or on it."""
+    return depth_m * np.float32(1 + SEEN_PER_M) + np.float32(SEEN_M)
+
+
 def _draw_lamps(light: F32, view: View, spots: Sequence[Spot]) -> F32:
     """Draw spots that nothing hides into an image, and return their glow."""
     colours, depth = drawn(spots, view)
-    visible = (depth < view.depth_m * (1 + SEEN_PER_M) + SEEN_M) & np.isfinite(depth)
+    visible = (depth < _farthest_m(view.depth_m)) & np.isfinite(depth)
     light[visible] = colours[visible]
     colours[~visible] = 0
     return cv2.GaussianBlur(colours, (0, 0), GLOW_WIDTHS * light.shape[1]) * np.float32(GLOW_SHARE)

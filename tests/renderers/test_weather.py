@@ -383,6 +383,18 @@ def test_lamps_of_road_users_are_red_from_behind_and_white_from_ahead(heading_x,
     )
 
 
+def test_a_lamp_that_is_hidden_is_not_mirrored_in_wet_ground():
+    oncoming, poses = car(-1.0)
+    wet = scene("time=night", "rain=20", "poles_spacing_m=0", "buildings=0", actors=(oncoming,))
+    road = depth_of_road()
+    mirrored = shown(wet, road, actors=poses).astype(int) - shown(wet, road)
+    assert mirrored[36:].max() > 20
+    behind_a_wall = np.where((road == 0) | (road > 8.0), np.float32(8.0), road)
+    assert np.array_equal(
+        shown(wet, behind_a_wall, actors=poses), shown(wet, behind_a_wall, actors={})
+    )
+
+
 def test_a_low_sun_ahead_veils_the_image_unless_it_is_hidden():
     scenario = scene("time=low_sun")
     to_camera = np.eye(4)
