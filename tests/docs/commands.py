@@ -20,7 +20,7 @@ NOT_RUN = (  # the first rule that fits counts
     (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda|doctor --gpu", "needs weights of 4 GB, or a GPU"),
     (
-        r"^train |^bench |FILE|fixer\.weights\.bundle",
+        r"^train |^bench |FILE|fixer\.weights\.bundle| data/scenes/",
         "trains or measures for minutes to days, or needs what that made",
     ),
     (r"path/to/|rollouts/|--scene scenes|runs/RUN", "names a file of the reader's"),
