@@ -2,14 +2,17 @@
 nothing.
 """
 
+import fcntl
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core import event
 
 from alpasim_plugin.core.kernel_sources import ROOT, sources_digest, sources_of
+from alpasim_plugin.core.kernels import LOCK, OneCompiler
 
 KERNEL = """
 import constants
@@ -103,4 +106,22 @@ def test_a_constant_that_was_changed_in_another_file_is_the_one_that_is_computed
     assert computed() == (16, code)
     (folder / "constants.py").write_text("TILE = 8\n")
     assert computed()[0] == 8
-    assert len(list(Path(kept).iterdir())) == 2
+    assert len(list(Path(kept).glob("kern-*"))) == 2
+
+
+def test_a_process_that_compiles_holds_the_lock_until_the_code_is_kept(tmp_path):
+    compiler = OneCompiler(tmp_path / "kept")
+
+    def is_held():
+        with (tmp_path / "kept" / LOCK).open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+            return False
+
+    held = []
+    for notify in (compiler.on_start, compiler.on_start, compiler.on_end, compiler.on_end):
+        notify(event.Event("numba:compiler_lock", event.EventStatus.START))
+        held.append(is_held())
+    assert held == [True, True, True, False]
