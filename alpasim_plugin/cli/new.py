@@ -57,8 +57,19 @@ def new(
         if os.path.exists(path):
             raise InputError(f"{path}: it exists already", "choose another name, or remove it")
     templates = files("alpasim_plugin.cli") / "templates"
-    for path, template in targets.items():
-        text = (templates / template).read_text(encoding="utf-8")
+    texts = {
+        path: (templates / template).read_text(encoding="utf-8")
+        for path, template in targets.items()
+    }
+    imported = find_spec(name) if kind != "scenario" else None
+    imports = rf"^(from|import) .*(?<![$\w]){words['Class']}\b"
+    in_use = any(re.search(imports, text, re.MULTILINE) for text in texts.values())
+    if in_use or (imported and imported.origin):
+        raise InputError(
+            f"name {name!r}: it would hide a class or a module that the written file imports",
+            f"choose another name: my_{name}",
+        )
+    for path, text in texts.items():
         write_text(path, Template(text).substitute(words))
     command = TRY[kind].format(file=words["file"], cls=words["Class"])
     test = f"python -m pytest {words['test']}"

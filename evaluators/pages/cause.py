@@ -370,6 +370,9 @@ def behind_others(run: Run, rollout: Rollout) -> list[str]:
     return [f"Behind {' and '.join(better)} the same rollout ends without an event."]
 
 
+FORK_S = 3.0  # before a failure, where no plans part: a fork at the failure repeats it
+
+
 def commands(run: Run, cause: Cause) -> list[tuple[str, str, str]]:
     """Return what can be asked next: a key, what it shows, the command."""
     rollout = cause.rollout
@@ -377,9 +380,10 @@ def commands(run: Run, cause: Cause) -> list[tuple[str, str, str]]:
         check = f"simrun check policy {shlex.quote(rollout.policy)}"
         return [("c", "test the policy alone", check)]
     cell = shlex.quote(f"{run.folder}/{cell_name(*rollout.cell)}")
-    at_s = cause.partings[0].at_s if cause.partings else cause.failed_s or 0.0
+    at_s = cause.partings[0].at_s if cause.partings else (cause.failed_s or 0.0) - FORK_S
     others = [one.name for one in cause.partings if one.kind == "renderer"]
     other = [*others, "3dgs" if rollout.renderer == "clean" else "clean"][0]
-    fork = f"simrun fork {cell} --at {max(0.0, at_s):.1f} --renderer {other}"
+    fork = f"simrun fork {cell} --at {max(0.0, at_s):.1f} --renderer {shlex.quote(other)}"
     view = f"simrun view {shlex.quote(str(run.folder / rollout.path))}"
-    return [("f", f"drive on from there behind {other}", fork), ("v", "watch the rollout", view)]
+    since = f"{max(0.0, at_s):.1f} s"
+    return [("f", f"drive on from {since} behind {other}", fork), ("v", "watch the rollout", view)]

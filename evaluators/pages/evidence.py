@@ -42,7 +42,7 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
         driven = speeds(log.ego)
         for plan in plans:
             speed = float(np.interp(plan.now_us, log.ego.t_us, driven))
-            asked = float(np.hypot(*(_ahead(plan, 1_000_000) - _ahead(plan, 900_000)))) / 0.1
+            asked = asked_mps(plan)
             if asked < BRAKES * speed:
                 before_s = (failed_us - plan.now_us) * 1e-6
                 found = f"The first plan that brakes comes {before_s:.1f} s before the contact"
@@ -93,6 +93,17 @@ def _ahead(plan: LoggedPlan, after_us: int) -> F64:
     end_us = min(plan.trajectory.t_us[-1], plan.now_us + after_us)
     now, then = interpolate(plan.trajectory, np.array([plan.trajectory.t_us[0], end_us]))
     return (inverse(now) @ then)[:2, 3]
+
+
+def asked_mps(plan: LoggedPlan) -> float:
+    """Return the speed in m/s that a plan asks for one second ahead, or at its end where it is
+    shorter: over its last tenth of a second up to there.
+    """
+    times_us = plan.trajectory.t_us
+    end_us = min(times_us[-1], max(times_us[0] + STEP_US, plan.now_us + 1_000_000))
+    begin_us = max(times_us[0], end_us - STEP_US)
+    begin, end = interpolate(plan.trajectory, np.array([begin_us, end_us]))[:, :2, 3]
+    return float(np.hypot(*(end - begin)) / ((end_us - begin_us) * 1e-6))
 
 
 def _beside_m(plan: LoggedPlan) -> float:

@@ -43,3 +43,14 @@ def test_a_name_that_is_no_file_of_python_is_refused(name, tmp_path, monkeypatch
     assert run_command(["new", "policy", name]) == 2
     assert "not a name of a Python file" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("policy", "plan"), ("renderer", "frame"), ("policy", "simrun"), ("metric", "numpy")],
+)
+def test_a_name_that_hides_an_import_is_refused(kind, name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["new", kind, name]) == 2
+    assert f"choose another name: my_{name}" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
