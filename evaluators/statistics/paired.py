@@ -38,8 +38,8 @@ from evaluators.results import (
     Verdict,
 )
 from evaluators.statistics.bounded import mean_bounds, upper_bound
+from evaluators.statistics.differences import flag_interval
 from evaluators.statistics.intervals import (
-    FEW_SCENES,
     ROUNDING,
     TOO_LARGE,
     Interval,
@@ -47,7 +47,6 @@ from evaluators.statistics.intervals import (
     cluster_means,
     mean_of,
     n_clusters,
-    paired_rate,
     scaled,
     t_interval,
     within,
@@ -446,31 +445,6 @@ def difference_bounds(
     )
     method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
-
-
-def flag_interval(delta: F64, scenes: I64) -> Interval:
-    """Return the interval of a difference of rates from ``(N,)`` differences per cell, in [-1, 1],
-    and their scenes; never without width.
-
-    The rates of cells that gained and that lost the event get their own intervals
-    (`mean_bounds`), which are joined by the method of variance estimates recovery (Zou and
-    Donner, Statistics in Medicine 27, 2008). Below `FEW_SCENES` scenes it is Tango's interval, with
-    scenes as pairs.
-    """
-    gained, _ = cluster_means(np.maximum(delta, 0.0), scenes)
-    lost, _ = cluster_means(np.maximum(-delta, 0.0), scenes)
-    n, up, down = len(gained), float(np.mean(gained)), float(np.mean(lost))
-    changed = int(np.sum((gained > 0) | (lost > 0)))
-    note = f"{changed} of {n} scenes changed" if changed < LEAST_SCENES else ""
-    if n < FEW_SCENES:
-        bounds = paired_rate(n * up, n * down, n)
-        return Interval(up - down, *bounds, note=note, method="Tango, scenes as pairs")
-    (up_low, up_high), (down_low, down_high) = (
-        mean_bounds(rates, 0.0, 1.0) for rates in (gained, lost)
-    )
-    low = max(up - down - math.hypot(up - up_low, down_high - down), -1.0)
-    high = min(up - down + math.hypot(up_high - up, down - down_low), 1.0)
-    return Interval(up - down, low, high, note=note, method="gained and lost rates joined")
 
 
 def reach_of(metric: MetricInfo, margin: float) -> float:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import EvaluatorError
 from evaluators.statistics.bounded import rate_interval
+from evaluators.statistics.differences import flag_interval
 from evaluators.statistics.intervals import cluster_means, exact_rate, paired_rate
-from evaluators.statistics.paired import flag_interval
 from tests.examples import examples
 
 shares = st.lists(st.sampled_from([0.0, 0.2, 1 / 3, 0.5, 0.8, 1.0]), min_size=2, max_size=40)
