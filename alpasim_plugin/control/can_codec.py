@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import can
 import numpy as np
@@ -82,6 +82,9 @@ class Sent(_Part):
 class Received(_Part):
     """A command to the simulation: steering wheel angle in degrees, left positive after ``scale``,
     or acceleration in m/s^2.
+
+    ``echo`` is a signal in which the control unit repeats the counter of the map's last sent
+    message, as it was when the unit computed the command.
     """
 
     message: str
@@ -89,6 +92,7 @@ class Received(_Part):
     scale: float = 1.0
     enabled: dict[str, int] = {}  # the command counts only while these signals have these values
     counter: str | None = None
+    echo: str | None = None
 
 
 class CanMap(_Part):
@@ -145,6 +149,14 @@ class BadFrame(Exception):
         self.fault = fault
 
 
+class Reading(NamedTuple):
+    """A decoded command: its value, its counter, and the counter of what it answers."""
+
+    value: float
+    counter: int | None
+    echo: int | None
+
+
 @dataclass
 class Codec:
     """Encodes and decodes the messages of a map."""
@@ -173,9 +185,17 @@ class Codec:
         signals = {name: quantities[quantity] for name, quantity in sent.signals.items()}
         return self.pack(sent.message, signals, sent.counter)
 
-    def encode_command(self, received: Received, value: float) -> can.Message:
-        """Return the frame of a command, as a control unit sends it."""
+    def encode_command(self, received: Received, value: float, echo: int = 0) -> can.Message:
+        """Return the frame of a command, as a control unit sends it.
+
+        Args:
+            received: The command.
+            value: In the unit of the map.
+            echo: Counter of what it answers.
+        """
         signals = {received.signal: value * received.scale, **received.enabled}
+        if received.echo is not None:
+            signals[received.echo] = echo
         return self.pack(received.message, signals, received.counter)
 
     def pack(self, name: str, values: Mapping[str, float], counter: str | None) -> can.Message:
@@ -200,8 +220,17 @@ class Codec:
         """Return how many values a message's counter has."""
         return 1 << int(self.message(name).get_signal_by_name(counter).length)
 
-    def decode(self, received: Received, data: bytes) -> tuple[float, int | None]:
-        """Return a command's value and counter.
+    def questions_since(self, echo: int) -> int:
+        """Return how often the map's last message was sent since the counter had a value, 0 for the
+        newest; modulo the counter's size.
+        """
+        last = self.map.send[-1]
+        assert last.counter is not None  # as `open_codec` has checked
+        size = self.counter_size(last.message, last.counter)
+        return (self._counters.get(last.message, -1) - echo) % size
+
+    def decode(self, received: Received, data: bytes) -> Reading:
+        """Return what a frame of a command says.
 
         Raises:
             BadFrame: Wrong length, a value that the database does not allow, or a command that is
@@ -223,7 +252,8 @@ class Codec:
         if not low - half <= value <= high + half:  # NaN is outside
             raise BadFrame("out_of_range")
         counter = None if received.counter is None else int(values[received.counter])
-        return value / received.scale, counter
+        echo = None if received.echo is None else int(values[received.echo])
+        return Reading(value / received.scale, counter, echo)
 
 
 def open_codec(can_map: CanMap, database: Path) -> Codec:
@@ -262,8 +292,29 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
             ) from refusal
         if codec.message(part.message).is_multiplexed():
             raise InputError(f"{location}: it is multiplexed", "name messages of one layout")
+    _check_echoes(codec, database)
     codec.notes = DBC.notes(_met(codec))
     return codec
+
+
+def _check_echoes(codec: Codec, database: Path) -> None:
+    """Refuse a map whose commands repeat a counter that is not sent, or does not fit.
+
+    Raises:
+        InputError: Naming the message.
+    """
+    sent = codec.map.send[-1:]
+    for received in (codec.map.steer, codec.map.accel):
+        if received.echo is None:
+            continue
+        counter = sent[0].counter if sent else None
+        if counter is None or codec.counter_size(received.message, received.echo) != (
+            codec.counter_size(sent[0].message, counter)
+        ):
+            raise InputError(
+                f"{database}, message {received.message}: echo {received.echo} has no counter of as many bits to repeat in the last message that the map sends",
+                "give the last message under send a counter, and echo as many bits",
+            )
 
 
 def _met(codec: Codec) -> Iterator[str]:

@@ -7,19 +7,20 @@ motion, continued under the last commands, and the ego follows it exactly.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.control.bicycle import BicycleState, Command, step
-from alpasim_plugin.control.can_bus import Address, Commands, Exchange, open_bus
+from alpasim_plugin.control.can_bus import Address, Commands, Exchange, OwnChannel, open_bus
 from alpasim_plugin.control.can_codec import load_map, open_codec
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import transform_points, yaw_of
+from alpasim_plugin.core.geometry import direction_of, left_of, yaw_of
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import (
     F64,
     EgoState,
+    Frame,
     Observation,
     Plan,
     Route,
@@ -55,14 +56,13 @@ class CanPolicy(Policy):
         can_map, database = load_map(self._address.map, self._address.dbc)
         self._ratio = can_map.steering_ratio
         self._codec = open_codec(can_map, database)
-        self._step_us = min((sent.period_us for sent in can_map.send), default=PLAN_STEP_US)
-        if self._period_us % self._step_us:
-            raise InputError(
-                f"can://{address}: the shortest message period is {self._step_us} us, the query period {self._period_us} us",
-                "choose a rates.policy_us that is a whole multiple",
-            )
         self._bus = open_bus(self._address, self._codec)
+        self._channel = OwnChannel(self._address.bus)
+        self._begin()
+
+    def _begin(self) -> None:
         self._exchange = Exchange(self._bus, self._codec, self._address.timeout_s)
+        self._commands = Commands(0.0, 0.0, "held")
         self._predicted: tuple[int, BicycleState] | None = None
         self._steer_rate = self._accel = 0.0
 
@@ -76,6 +76,11 @@ class CanPolicy(Policy):
         parsed = Address.parse(address)
         open_codec(*load_map(parsed.map, parsed.dbc))
 
+    @staticmethod
+    def channel_of(address: str) -> str:
+        """Return what a rollout has for itself: the bus of an address."""
+        return Address.parse(address).bus
+
     @classmethod
     def address_notes(cls, address: str) -> tuple[str, ...]:
         """Return what is not read of the database that an address names."""
@@ -83,48 +88,40 @@ class CanPolicy(Policy):
         return open_codec(*load_map(parsed.map, parsed.dbc)).notes
 
     def reset(self, seed: int, route: Route) -> None:
-        """Start a new rollout on the same bus: counts, commands and motion begin anew."""
-        self._exchange = Exchange(self._bus, self._codec, self._address.timeout_s)
-        self._predicted = None
+        """Start a new rollout on the same bus: counts, commands and motion begin anew, and frames
+        of before are forgotten.
+
+        Raises:
+            InfrastructureError: Another rollout has the channel.
+        """
+        self._channel.take()
+        self._begin()
+        self._exchange.forget()
 
     def act(self, observation: Observation) -> Plan:
         """Run the bus until the next query and return the motion that its commands make.
 
         Raises:
             PolicyError: The bus refuses to send.
+            InfrastructureError: The control unit sends nothing at all.
         """
         now = observation.t_us
-        start = self._start(observation)
+        states = [self._start(observation)]
         path = observation.route_rig[np.isfinite(observation.route_rig).all(axis=1)]
-        states = [start]
-        state = start
-        commands = Commands(0.0, 0.0, "held")
-        for t_us in range(now, now + self._period_us, self._step_us):
-            commands = self._exchange.step(
-                t_us,
-                quantities(state, self._steer_rate, self._accel, path, self._ratio, self._vehicle),
-            )
-            before = state
-            state = step(state, self._command(commands), self._step_us * 1e-6, self._vehicle)
-            self._steer_rate = (state.steer_rad - before.steer_rad) / (self._step_us * 1e-6)
-            self._accel = (state.speed_mps - before.speed_mps) / (self._step_us * 1e-6)
-            states.append(state)
-        T_world_rig = observation.ego.T_world_rig
-        x, y, _ = transform_points(T_world_rig, np.array([[state.x_m, state.y_m, 0.0]]))[0]
-        self._predicted = (
-            now + self._period_us,
-            BicycleState(
-                float(x),
-                float(y),
-                state.yaw_rad + yaw_of(T_world_rig),
-                state.speed_mps,
-                state.steer_rad,
-            ),
-        )
-        times = [now + self._step_us * i for i in range(len(states))]
+        until_us = now + self._period_us
+        instants = self._exchange.instants(now, until_us)
+        times = [now]
+        for t_us, next_us in pairwise([*dict.fromkeys((now, *instants)), until_us]):
+            if t_us in instants:
+                self._commands = self._exchange.step(t_us, self._quantities(states[-1], path))
+            before = states[-1]
+            states.append(self._moved(before, next_us - t_us))
+            times.append(next_us)
+            self._steer_rate = (states[-1].steer_rad - before.steer_rad) / ((next_us - t_us) * 1e-6)
+            self._accel = (states[-1].speed_mps - before.speed_mps) / ((next_us - t_us) * 1e-6)
+        self._predicted = until_us, _in_world(states[-1], observation.ego)
         while times[-1] < now + PLAN_US:
-            state = step(state, self._command(commands), PLAN_STEP_US * 1e-6, self._vehicle)
-            states.append(state)
+            states.append(self._moved(states[-1], PLAN_STEP_US))
             times.append(times[-1] + PLAN_STEP_US)
         xy = np.array([[s.x_m, s.y_m] for s in states])
         return Plan(
@@ -132,18 +129,30 @@ class CanPolicy(Policy):
             np.array(times),
             xy,
             np.array([s.yaw_rad for s in states]),
-            debug={"mark": commands.mark},
+            debug={"mark": self._commands.mark},
         )
+
+    def end(self, frames: Mapping[str, Frame]) -> None:
+        """Wait for what the unit still owes, and let other rollouts use the channel.
+
+        Raises:
+            InfrastructureError: The control unit has sent nothing at all.
+        """
+        try:
+            self._exchange.finish()
+        finally:
+            self._channel.release()
 
     def close(self) -> None:
         """Close the bus."""
+        self._channel.release()
         self._bus.shutdown()
 
     def facts(self) -> Mapping[str, Any]:
         """Return what happened on the bus, for the rollout's manifest."""
         return {
             "notes": list(self._codec.notes),
-            "bus": f"{self._address.interface}:{self._address.channel}",
+            "bus": self._address.bus,
             **self._exchange.facts(),
         }
 
@@ -163,11 +172,27 @@ class CanPolicy(Policy):
         self._accel = ego.accel_mps2
         return BicycleState(0.0, 0.0, 0.0, ego.speed_mps, _steer_of(ego, self._vehicle))
 
-    def _command(self, commands: Commands) -> Command:
+    def _quantities(self, state: BicycleState, path: F64) -> dict[str, float]:
+        return quantities(state, self._steer_rate, self._accel, path, self._ratio, self._vehicle)
+
+    def _moved(self, state: BicycleState, duration_us: int) -> BicycleState:
+        """Return the state after a time under the commands that hold."""
+        commands = self._commands
         steer = float(np.deg2rad(commands.wheel_deg)) / self._ratio
-        if commands.accel_mps2 >= 0:
-            return Command(steer, commands.accel_mps2)
-        return Command(steer, 0.0, -commands.accel_mps2)
+        command = Command(steer, max(commands.accel_mps2, 0.0), max(-commands.accel_mps2, 0.0))
+        return step(state, command, duration_us * 1e-6, self._vehicle)
+
+
+def _in_world(state: BicycleState, ego: EgoState) -> BicycleState:
+    """Return a state of the rig's plane in the world, by the ego's heading alone: as the loop lays
+    plans on the ground, whatever its slope (`LoopState.to_world`).
+    """
+    yaw_rad = yaw_of(ego.T_world_rig)
+    ahead = direction_of(np.array(yaw_rad))
+    xy = ego.T_world_rig[:2, 3] + state.x_m * ahead + state.y_m * left_of(ahead)
+    return BicycleState(
+        float(xy[0]), float(xy[1]), state.yaw_rad + yaw_rad, state.speed_mps, state.steer_rad
+    )
 
 
 def quantities(

@@ -7,7 +7,7 @@ PARTS = (
         kind="policy",
         name="can://",
         target="alpasim_plugin.control.can_policy:CanPolicy",
-        help="a control unit on a CAN bus: can://[INTERFACE:]CHANNEL[?map=NAME&dbc=FILE]",
+        help="a control unit on a CAN bus: can://INTERFACE:CHANNEL[?map=NAME&dbc=FILE]",
     ),
     RegisteredPart(
         kind="controller",

@@ -258,13 +258,18 @@ def _run_local(jobs: Sequence[Job], plan: RunPlan, root: Path, how: HowToRun) ->
         action, state = find_rollout_state(job[0], root, reuse_undigested=True)
         return state.manifest if action == "none" else None
 
-    driven = run_jobs(work, jobs, workers, threads, how.limit_s, written, _users_parts)
+    driven = run_jobs(work, jobs, workers, threads, how.limit_s, written, _users_parts, _channel_of)
     for (cell, _), result in driven:
         yield cell, _lost(cell, root, result) if isinstance(result, Lost) else result
 
 
 def _users_parts(job: Job) -> str:
     return users_parts(job[0])
+
+
+def _channel_of(job: Job) -> str:
+    cell, original = job
+    return cell.policy.channel if original is None else ""
 
 
 def _work(options: RunOptions, root: Path, local_threads: Threads, job: Job) -> Manifest:

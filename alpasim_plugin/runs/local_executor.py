@@ -99,6 +99,7 @@ def run_jobs(
     limit_s: float | None = None,
     stored_result: Callable[[J], R | None] = lambda job: None,
     parts_of: Callable[[J], str] = lambda job: "",
+    channel_of: Callable[[J], str] = lambda job: "",
 ) -> Iterator[tuple[J, R | Lost]]:
     """Yield every job with its result, as they finish; results do not depend on the workers.
 
@@ -113,6 +114,8 @@ def run_jobs(
         limit_s: Seconds that one job may take before its worker is ended; None: no limit.
         stored_result: Returns the result of a job whose worker died, if it was finished before.
         parts_of: Names the parts of the user's that a job calls; empty where it calls none.
+        channel_of: Names what a job has for itself: jobs of the same one are done one at a time;
+            empty where it has nothing.
 
     Raises:
         The first exception of ``work``; what still runs is ended.
@@ -122,7 +125,7 @@ def run_jobs(
             yield job, work(job)
         return
     victims = []
-    with _opened(_Pool(work, workers, threads, limit_s, parts_of)) as pool:
+    with _opened(_Pool(work, workers, threads, limit_s, parts_of, channel_of)) as pool:
         for job, result in pool.results(jobs):
             if isinstance(result, Lost) and result.may_be_chance:
                 victims.append(job)
@@ -285,12 +288,14 @@ class _Pool(Generic[J, R]):
         threads: int,
         limit_s: float | None,
         parts_of: Callable[[J], str],
+        channel_of: Callable[[J], str],
     ) -> None:
         self.workers = workers
         self._work = work
         self._threads = threads
         self._limit_s = limit_s
         self._parts_of = parts_of
+        self._channel_of = channel_of
         self._notes = tempfile.TemporaryDirectory(prefix="simrun-workers-")
         self._busy: list[_Worker] = []
         self._idle: list[_Worker] = []
@@ -305,8 +310,8 @@ class _Pool(Generic[J, R]):
         """
         waiting = deque(jobs)
         while waiting or self._busy:
-            while waiting and len(self._busy) < self.workers:
-                self._begin(waiting)
+            while len(self._busy) < self.workers and (startable := self._startable(waiting)):
+                self._begin(waiting, startable)
             wait([handle for worker in self._busy for handle in worker.handles], POLL_S)
             for worker in [one for one in self._busy if one.is_done(self._limit_s)]:
                 result = worker.take(self._limit_s)
@@ -315,13 +320,25 @@ class _Pool(Generic[J, R]):
                     self._idle.append(worker)
                 yield worker.job, result
 
-    def _begin(self, waiting: deque[J]) -> None:
-        """Hand the next job to a worker that may do it, a new one where there is none."""
+    def _startable(self, waiting: Sequence[J]) -> Sequence[int]:
+        """Return which jobs may begin now: those of a channel that no worker uses."""
+        used = {self._channel_of(worker.job) for worker in self._busy} - {""}
+        if not used:
+            return range(len(waiting))
+        return [n for n, job in enumerate(waiting) if self._channel_of(job) not in used]
+
+    def _begin(self, waiting: deque[J], startable: Sequence[int]) -> None:
+        """Hand the next job to a worker that may do it, a new one where there is none.
+
+        Args:
+            waiting: The jobs.
+            startable: Which of them may begin, at least one.
+        """
         worker = None
-        number = 0
+        number = startable[0]
         while self._idle and worker is None:
             worker = self._idle.pop()
-            fitting = [n for n, job in enumerate(waiting) if self._may_do(worker, job)]
+            fitting = [n for n in startable if self._may_do(worker, waiting[n])]
             if fitting:
                 number = fitting[0]
             else:

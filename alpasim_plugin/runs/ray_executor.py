@@ -13,7 +13,7 @@ import signal
 import socket
 import tempfile
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -146,8 +146,8 @@ def run_on_ray(
         running: dict[Any, Cell] = {}
         try:
             while waiting or running:
-                while waiting and len(running) < workers:
-                    cell = waiting.popleft()
+                while len(running) < workers and (cell := _startable(waiting, running.values())):
+                    waiting.remove(cell)
                     scenario = scenarios[cell.scene]
                     # As bytes: a node without the code of a part cannot read the cell.
                     job = pickle.dumps((cell, plan.options, executor.cores, limit_s))
@@ -158,6 +158,12 @@ def run_on_ray(
         finally:
             for task in running:
                 ray.cancel(task, force=True)
+
+
+def _startable(waiting: Iterable[Cell], running: Iterable[Cell]) -> Cell | None:
+    """Return the first rollout of a channel that no other one uses; None where there is none."""
+    used = {cell.policy.channel for cell in running} - {""}
+    return next((cell for cell in waiting if cell.policy.channel not in used), None)
 
 
 def _require_node(ray: Any, executor: Executor) -> None:

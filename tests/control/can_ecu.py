@@ -39,9 +39,10 @@ class LaneKeeper:
         if one is not can_map.send[-1] or "speed_kph" not in self._seen:
             return []
         wheel_deg, accel_mps2 = self.command()
+        echo = int(values[one.counter]) if one.counter else 0
         return [
-            self._codec.encode_command(can_map.steer, wheel_deg),
-            self._codec.encode_command(can_map.accel, accel_mps2),
+            self._codec.encode_command(can_map.steer, wheel_deg, echo),
+            self._codec.encode_command(can_map.accel, accel_mps2, echo),
         ]
 
     def command(self):

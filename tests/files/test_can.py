@@ -46,7 +46,7 @@ def opened(folder, *parts, steer="", accel="", send=""):
 
 def answered(codec, *frames):
     """Send frames to one end of a bus and take them in at the other."""
-    address = Address.parse(f"test-files-{id(frames)}")
+    address = Address.parse(f"virtual:test-files-{id(frames)}")
     with open_bus(address, codec) as one, open_bus(address, codec) as other:
         exchange = Exchange(one, codec, timeout_s=0.01)
         for frame in frames:

@@ -177,6 +177,7 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     factory = load(target, kind)
     if address is not None and hasattr(factory, "check_address"):
         factory.check_address(address)
+    channel = factory.channel_of(address) if hasattr(factory, "channel_of") else ""
     overrides = (*at_steps, *overrides)
     model: Any = getattr(factory, "settings_model", None)
     if model is None:
@@ -190,7 +191,7 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
         settings = validate(
             model, apply_overrides(Document({}, {}, f"the defaults of {plain}"), overrides)
         )
-    return PartSpec(kind, name, target, settings, address=address)
+    return PartSpec(kind, name, target, settings, address=address, channel=channel)
 
 
 def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:

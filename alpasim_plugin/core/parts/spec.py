@@ -92,6 +92,8 @@ class PartSpec:
         controller: A policy's controller.
         is_blind: A policy whose class declares that it has no camera (``sensors = ()``).
         address: What follows ``scheme://`` in the name of a remote part.
+        channel: What a rollout has for itself, such as the channel of a bus: rollouts that name the
+            same one are driven one at a time. Empty: nothing.
         missing: What must be given before it can be built; empty where nothing is missing.
     """
 
@@ -108,6 +110,7 @@ class PartSpec:
     controller: str = ""
     is_blind: bool = False
     address: str | None = None
+    channel: str = ""
     missing: str = ""
 
     @property
