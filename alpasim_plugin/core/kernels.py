@@ -32,7 +32,7 @@ LOCK = ".compiling.lock"
 Maker = Callable[[Callable[..., Any]], Any]
 
 
-class OneCompiler(event.Listener):
+class OneCompiler(event.Listener):  # type: ignore[misc]  # Numba has no types
     """Holds a lock file while a thread of this process has Numba's lock of the compiler, which
     covers reading the cache, compiling and writing the cache.
 
