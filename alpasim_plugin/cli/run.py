@@ -202,8 +202,8 @@ class SearchOptions:
     vary: Annotated[
         tuple[str, ...],
         Flag(
-            "Find where each variant starts to fail along a key, or two. Repeatable.",
-            metavar="KEY=LOW..HIGH",
+            "Find where each variant fails along a key, or two, at points STEP apart. Repeatable.",
+            metavar="KEY=LOW..HIGH[/STEP]",
         ),
     ] = ()
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.parts import names
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from alpasim_plugin.runs.plan import RunOptions, make_plan
@@ -66,7 +67,16 @@ def run_self_test(
         root: Run folder; finished rollouts in it are reused.
         command: Written to run.json.
         progress: Shows both runs.
+
+    Raises:
+        InputError: The gate has a ``boundary_margin``, which needs a run with ``--vary``.
     """
+    if spec.boundary_margin is not None:
+        raise InputError(
+            "--self-test: a gate with boundary_margin counts points of --vary, and the self-test "
+            "drives none",
+            "Test a gate with metrics.",
+        )
     broken = [name for name in names("renderer") if name.startswith("broken-")]
     suite = load_suite(SUITE)
     options = RunOptions(preset=spec.preset or DEFAULT, baseline=REFERENCE)

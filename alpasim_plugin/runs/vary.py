@@ -1,9 +1,10 @@
-"""Sequential search along one or two parameters of a scene: drive the points of a grid that enclose
-where each variant starts to fail.
+"""Sequential search along one or two parameters of a scene: drive evenly spaced points, and those of a
+finer grid between neighbours of which a variant fails at one.
 
 Everything but the parameters stays as it is: the scene is the same, and so is the noise, since every
 point bears the scene's name with its values behind it (`core.seeding.POINT`). What is driven next
-follows from the outcomes alone, so the same command continues after any interruption.
+follows from the outcomes alone, so the same command continues after any interruption. A point that
+one variant or seed asks for is driven with all of them, so that all are compared at equal points.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from alpasim_plugin.runs.run import Progress
 from evaluators.metrics.outcomes import OUTCOMES, POLICY_FAULT
 from evaluators.pages.boundary import sentence_of
 from evaluators.statistics.boundary import (
-    MOST_POINTS,
-    STEPS,
-    Bracket,
-    Interval,
-    boundary_of,
-    bracket_of,
+    PARTS,
+    SPACINGS,
     difference_of,
+    median_boundary,
     next_points,
+    stretches_of,
+    widest_gap,
 )
-from evaluators.statistics.boundary_area import AREA_STEPS, MOST_AREA_POINTS, Area, area_of
+from evaluators.statistics.boundary_area import AREA_PARTS, AREA_SPACINGS, Lines, claims_of
 from evaluators.statistics.variants import Variant, usual_base, variants_of
 from scenarios.suite import ScenarioRef
 
 UNITS = {"mps": "m/s", "mps2": "m/s\u00b2", "m": "m", "s": "s", "us": "\u00b5s", "rad": "rad"}
-RANGE = re.compile(r"([A-Za-z_][\w.\-]*)=([^=]+?)\.\.([^=]+)")
-EXAMPLE = "Write for example --vary actors.cutter.s_m=4..14."
+RANGE = re.compile(r"([A-Za-z_][\w.\-]*)=([^=]+?)\.\.([^=/]+)(?:/([^=/]+))?")
+EXAMPLE = "Write for example --vary actors.cutter.s_m=4..14, or 4..14/0.5 for points 0.5 apart."
+MOST_SPACINGS = 200  # of a range
 MakePlan = Callable[[Sequence[ScenarioRef]], RunPlan]
 Point = tuple[int, ...]  # of the grid, a step of each parameter
 
@@ -53,42 +54,71 @@ class Sweep:
     Attributes:
         key: Dotted key of the scenario file.
         low, high: Ends of the range.
-        steps: Of the grid between them.
+        spacings: Between its first points.
+        parts: Into which the grid divides each.
     """
 
     key: str
     low: float
     high: float
-    steps: int = STEPS
+    spacings: int = SPACINGS
+    parts: int = PARTS
 
     @classmethod
-    def parse(cls, text: str, steps: int = STEPS) -> Sweep:
-        """Read ``KEY=LOW..HIGH``.
+    def parse(cls, text: str, spacings: int = SPACINGS, parts: int = PARTS) -> Sweep:
+        """Read ``KEY=LOW..HIGH`` or ``KEY=LOW..HIGH/STEP``.
+
+        Args:
+            text: As the user wrote it. First points are at most ``STEP`` apart: closer where it does
+                not divide the range.
+            spacings: Between first points where there is no ``STEP``.
+            parts: Into which the grid divides each.
 
         Raises:
-            InputError: Another form, no numbers, or ``LOW`` is not below ``HIGH``.
+            InputError: Another form, no numbers, ``LOW`` is not below ``HIGH``, or ``STEP`` does not
+                fit between them.
         """
         match = RANGE.fullmatch(text.strip())
         if match is None:
-            raise InputError(f"--vary {text}: not KEY=LOW..HIGH", EXAMPLE)
+            raise InputError(f"--vary {text}: not KEY=LOW..HIGH or KEY=LOW..HIGH/STEP", EXAMPLE)
         try:
             low = float(match[2])
             high = float(match[3])
+            step = float(match[4]) if match[4] else None
         except ValueError:
-            raise InputError(f"--vary {text}: an end is not a number", EXAMPLE) from None
+            raise InputError(
+                f"--vary {text}: an end or the step is not a number", EXAMPLE
+            ) from None
         if not -1e12 < low < high < 1e12:
             raise InputError(f"--vary {text}: LOW is not below HIGH", EXAMPLE)
         if match[1] == "seed":
             raise InputError(
                 f"--vary {text}: every seed is another scene", "Use --seeds, or name a parameter."
             )
-        sweep = cls(match[1], low, high, steps)
-        if len(set(sweep.values)) <= steps:
+        if step is not None:
+            if not (high - low) / MOST_SPACINGS <= step <= high - low:
+                raise InputError(
+                    f"--vary {text}: a step of {step:g} in a range of {high - low:g}",
+                    f"Give a step of {(high - low) / MOST_SPACINGS:.3g} to {high - low:g}.",
+                )
+            spacings = math.ceil((high - low) / step - 1e-9)
+        sweep = cls(match[1], low, high, spacings, parts)
+        if len(set(sweep.values)) <= sweep.steps:
             raise InputError(
-                f"--vary {text}: its {steps + 1} points round to fewer values",
-                "Give a wider range.",
+                f"--vary {text}: its {sweep.steps + 1} points round to fewer values",
+                "Give a wider range or a larger step.",
             )
         return sweep
+
+    @property
+    def steps(self) -> int:
+        """Give the steps of the grid."""
+        return self.spacings * self.parts
+
+    @property
+    def first(self) -> range:
+        """Give the first points."""
+        return range(0, self.steps + 1, self.parts)
 
     @property
     def values(self) -> list[float]:
@@ -120,7 +150,8 @@ def parse_sweeps(texts: Sequence[str]) -> tuple[Sweep, ...]:
         raise InputError(
             f"--vary: {len(texts)} parameters", "Name at most two, and fix others by --set."
         )
-    sweeps = [Sweep.parse(text, AREA_STEPS if len(texts) == 2 else STEPS) for text in texts]
+    sizes = (AREA_SPACINGS, AREA_PARTS) if len(texts) == 2 else (SPACINGS, PARTS)
+    sweeps = [Sweep.parse(text, *sizes) for text in texts]
     if len({sweep.key for sweep in sweeps}) < len(sweeps):
         raise InputError(f"--vary: {sweeps[0].key} is named twice", "Name two parameters.")
     return tuple(sorted(sweeps, key=lambda sweep: sweep.key))
@@ -153,10 +184,14 @@ class BoundarySearch:
 
     def __post_init__(self) -> None:
         ref = self.plan.cells[0].ref
-        varied = digest([[one.key, one.low, one.high, one.steps] for one in self.sweeps])
+        varied = digest(
+            [[one.key, one.low, one.high, one.spacings, one.parts] for one in self.sweeps]
+        )
         self.plan = replace(self.plan, question=varied)
         self.is_area = len(self.sweeps) == 2
-        most = MOST_AREA_POINTS if self.is_area else MOST_POINTS
+        most = math.prod(sweep.steps + 1 for sweep in self.sweeps)
+        if self.is_area:  # points beside all lines of first points are never driven
+            most -= math.prod(sweep.spacings for sweep in self.sweeps)
         self.ceiling = replace(self.plan, cells=self.plan.cells * most, whole=self.plan)
         self.own_id = self.plan.cells[0].scene.removesuffix(f"-seed{ref.seed}")
         self.ref = ref
@@ -224,21 +259,33 @@ class BoundarySearch:
         if self.is_area:
             from alpasim_plugin.runs.vary_study import next_points as next_area_points
 
-            return next_area_points(failed, self.skipped)
+            return next_area_points(failed, self._lines, self.skipped)
         skipped = {step for (step,) in self.skipped}
-        return [(step,) for step in next_points(_steps(failed), skipped)]
+        first = self.reached[0].first
+        return [(step,) for step in next_points(_steps(failed), first, skipped)]
+
+    @property
+    def _lines(self) -> Lines:
+        """Give the steps of the first points, of two parameters."""
+        return self.reached[0].first, self.reached[1].first
 
     def next_plan(self) -> RunPlan | None:
-        """Return the rollouts of the next round; None where the search has ended."""
+        """Return the rollouts of the next round; None where the search has ended.
+
+        A point that one variant or seed asks for is driven with all.
+        """
         if self.stopped:
             return None
-        cells: list[Cell] = []
-        for (variant, seed), failed in self.failed.items():
+        wanted: set[Point] = set()
+        for failed in self.failed.values():
             points: list[Point] = []
             while not points and (candidates := self._candidates(failed)):
                 points = [point for point in candidates if self._is_reachable(self._values(point))]
                 self.skipped |= set(candidates) - set(points)
-            for point in points:
+            wanted |= set(points)
+        cells: list[Cell] = []
+        for (variant, seed), failed in self.failed.items():
+            for point in sorted(wanted - set(failed)):
                 plan = self.scenes[self._values(point)]
                 self.points[plan.cells[0].scene] = point
                 cells += [
@@ -276,16 +323,7 @@ class BoundarySearch:
         for cell, manifest in zip(plan.cells, manifests, strict=True):
             self.cells.append(cell)
             self.driven[cell.folder.as_posix()] = manifest
-            if not manifest.ok:
-                failed = True if manifest.failure_class == POLICY_FAULT else None
-            else:
-                metrics = manifest.metrics
-                measured = [metrics[name] for name in OUTCOMES if name in metrics]
-                failed = any(one.value is not None and one.value >= 0.5 for one in measured)
-                needed = ("collision_any", "offroad")
-                is_known = all(name in metrics and metrics[name].valid for name in needed)
-                if not failed and not is_known:
-                    failed = None  # it is not known
+            failed = has_failed(manifest)
             if failed is None:
                 self.stopped = f"{cell.folder.as_posix()} has no outcome"
                 continue
@@ -294,86 +332,80 @@ class BoundarySearch:
 
     def record(self) -> JsonObject:
         """Return what ``summary.json`` holds of the search, as its member ``boundary``."""
-        facts_by_variant = {one: self._of_variant(one) for one in self.variants}
+        facts_by_variant = {variant: self._of_variant(variant) for variant in self.variants}
         base = usual_base(self.variants, self.plan.options.baseline)
+        first = [[sweep.values[step] for step in sweep.first] for sweep in self.reached]
         differences = {}
         for variant, other in base.pairs(self.variants):
-            brackets = facts_by_variant[variant][1]
-            others = facts_by_variant[other][1]
-            if brackets and others:
-                estimate = difference_of(brackets, others)
-                differences[variant.name] = {"baseline": other.name} | vars(estimate)
-        grid_points = math.prod(one.steps + 1 for one in self.sweeps)
+            now, was = (facts_by_variant[side]["outcomes"] for side in (variant, other))
+            if not self.stopped and (difference := difference_of(now, was, first)):
+                differences[variant.name] = {"baseline": other.name} | vars(difference)
+        grid_points = math.prod(sweep.steps + 1 for sweep in self.sweeps)
         record: JsonObject = {
-            "parameter": self._per_parameter([one.key for one in self.sweeps]),
-            "unit": self._per_parameter([one.unit for one in self.sweeps]),
-            "range": self._per_parameter([[one.low, one.high] for one in self.sweeps]),
-            "reachable": self._per_parameter([[one.low, one.high] for one in self.reached]),
+            "parameter": self._per_parameter([sweep.key for sweep in self.sweeps]),
+            "unit": self._per_parameter([sweep.unit for sweep in self.sweeps]),
+            "range": self._per_parameter([[sweep.low, sweep.high] for sweep in self.sweeps]),
+            "reachable": self._per_parameter([[sweep.low, sweep.high] for sweep in self.reached]),
+            "spacing": self._per_parameter(
+                [(sweep.high - sweep.low) / sweep.spacings for sweep in self.reached]
+            ),
+            "first": self._per_parameter(first),
             "unreachable": {
-                ", ".join(f"{one:g}" for one in values): error.message
+                ", ".join(f"{value:g}" for value in values): error.message
                 for values, error in self.unreachable.items()
             },
             "stopped": self.stopped,
             "rollouts": len(self.driven),
             "grid_rollouts": grid_points * len(self.failed),
-            "variants": {one.name: facts for one, (facts, _) in facts_by_variant.items()},
+            "variants": {variant.name: facts for variant, facts in facts_by_variant.items()},
             "differences": differences,
         }
+        if not self.is_area:
+            gaps = [widest_gap(facts["outcomes"]) for facts in facts_by_variant.values()]
+            record["apart"] = max(gaps)
         return record | {"sentence": sentence_of(record)}
 
     def _per_parameter(self, items: Sequence[Any]) -> Any:
         """Return the facts of two parameters as a list, or the fact of a single parameter."""
         return list(items) if self.is_area else items[0]
 
-    def _of_variant(self, variant: Variant) -> tuple[JsonObject, Sequence[Interval]]:
-        """Return the facts of a variant, and the brackets or areas of its seeds if all have one."""
+    def _of_variant(self, variant: Variant) -> JsonObject:
+        """Return the facts of a variant."""
         seeds = {seed: self.failed[variant, seed] for seed in self.plan.seeds}
-        values = self.reached[-1].values
-        ended = {
-            seed: area_of(failed, values)
-            if self.is_area
-            else bracket_of(_steps(failed), dict(enumerate(values)))
+        outcomes = {
+            str(seed): [[*self._values(point), failed[point]] for point in sorted(failed)]
             for seed, failed in seeds.items()
         }
-        facts: JsonObject = {
-            "outcomes": {
-                str(seed): [[*self._values(point), failed[point]] for point in sorted(failed)]
-                for seed, failed in seeds.items()
-            }
-        }
-        areas = {seed: end for seed, end in ended.items() if isinstance(end, Area)}
-        brackets = [end for end in ended.values() if isinstance(end, Bracket)]
-        reasons = [end for end in ended.values() if isinstance(end, str)]
+        facts: JsonObject = {"outcomes": outcomes}
         if self.stopped:
-            reasons.append("not finished")
-        elif len({bracket.fails_below for bracket in brackets}) > 1:
-            reasons.append("fails on either side, by seed")
-        if reasons:
-            counted = [f"{why} in {reasons.count(why)} of {len(ended)} seeds" for why in reasons]
-            return facts | {"reason": "; ".join(dict.fromkeys(counted))}, []
+            return facts | {"reason": "not finished"}
         if self.is_area:
-            return facts | _area_facts(areas), list(areas.values())
-        return facts | _bracket_facts(brackets), brackets
+            areas = {
+                str(seed): vars(claims_of(failed, self._lines)) for seed, failed in seeds.items()
+            }
+            return facts | {"areas": areas}
+        median = median_boundary(outcomes)
+        return facts | {
+            "stretches": [vars(stretch) for stretch in stretches_of(outcomes)],
+            "median": None if median is None else vars(median),
+        }
 
 
-def _area_facts(areas: Mapping[int, Area]) -> JsonObject:
-    """Return the facts of a boundary in two parameters, of which each seed has an area."""
-    return {
-        "contradictions": sum(area.contradictions for area in areas.values()),
-        "areas": {str(seed): vars(area) for seed, area in areas.items()},
-        **vars(boundary_of(list(areas.values()))),
-    }
+def has_failed(manifest: Manifest) -> bool | None:
+    """Tell whether a drive ended in an outcome that counts as a failure; None where that is not known.
 
-
-def _bracket_facts(brackets: Sequence[Bracket]) -> JsonObject:
-    """Return the facts of a boundary along one parameter, of which each seed has a bracket; all fail
-    on the same side.
+    Args:
+        manifest: Of its rollout; an outcome is one of `evaluators.metrics.outcomes.OUTCOMES`.
     """
-    return {
-        "fails": "below" if brackets[0].fails_below else "above",
-        "changes": max(bracket.changes for bracket in brackets),
-        **vars(boundary_of(brackets)),
-    }
+    if not manifest.ok:
+        return True if manifest.failure_class == POLICY_FAULT else None
+    metrics = manifest.metrics
+    measured = [metrics[name].value for name in OUTCOMES if name in metrics]
+    if any(value is not None and value >= 0.5 for value in measured):
+        return True
+    needed = ("collision_any", "offroad")
+    is_known = all(name in metrics and metrics[name].valid for name in needed)
+    return False if is_known else None
 
 
 def _steps(failed: Mapping[Point, bool]) -> dict[int, bool]:

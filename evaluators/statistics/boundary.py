@@ -1,92 +1,99 @@
-"""Where along one parameter of a scene a policy starts to fail: which points of a grid are driven
-next, the boundary of each seed, and their mean with its interval.
+"""Where along one parameter of a scene a policy fails: which points of a grid are driven next, and
+what the driven points say.
 
-A seed is a repeatable policy. Bisection encloses a change of its outcome between two neighbouring
-points of the grid; then points beside it are driven, and where the outcome changes again the bracket
-reaches from the first change to the last. Over seeds the boundary is the mean of the middles, with
-Student's interval widened by half a bracket.
+The first points stand evenly apart; wherever two driven neighbours differ in their outcome, points
+between them are driven until they are neighbours of the grid. Nothing is assumed about how often the
+outcome changes. A claim names driven points and how far apart they stand; between two neighbours that
+differ the outcome changes at least once, and what is narrower than the distance of neighbours that do
+not differ is not seen.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 import scipy  # its submodules load on first use; scipy.stats would take a second
 
-STEPS = 64  # of the grid between both ends of the range
-FIRST = range(0, STEPS + 1, STEPS // 4)  # driven before the bisection; they show a second change
-BESIDE = (2, 4)  # steps from the outermost changes that are driven too
-MOST_POINTS = 24  # that a seed drives: after 20 no more are asked for
+from alpasim_plugin.core.types import F64
+
+SPACINGS = 16  # between the first points of a range whose key names no spacing
+PARTS = 4  # of a spacing: the distance of neighbours of the grid
 CONFIDENCE = 0.95
+
+Outcomes = Mapping[str, Sequence[Sequence[float]]]  # seed -> driven points, each with its outcome
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Neighbouring driven points of a variant at which no seed, some seeds or all seeds fail.
+
+    Attributes:
+        low, high: Values of the parameter at its outermost points.
+        points: How many were driven.
+        least, most: Seeds that fail at a point, of ``seeds``.
+        seeds: Number of seeds.
+    """
+
+    low: float
+    high: float
+    points: int
+    least: int
+    most: int
+    seeds: int
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Values between which what is sought of one seed lies."""
+    """Values between which a median lies."""
 
     low: float
     high: float
 
-    @property
-    def middle(self) -> float:
-        """Give the middle of both values."""
-        return 0.5 * (self.low + self.high)
-
-    @property
-    def half_width(self) -> float:
-        """Give half of their distance."""
-        return 0.5 * (self.high - self.low)
-
 
 @dataclass(frozen=True)
-class Bracket(Interval):
-    """The change of outcome of one seed.
+class Difference:
+    """Outcomes of two variants at points that both have driven, paired by point and seed.
 
     Attributes:
-        low, high: Values of the parameter between which the outcome changes.
-        fails_below: The drive fails at ``low`` and not at ``high``.
-        changes: How often the outcome changes between them.
+        pairs: Their number.
+        gained: Pairs of which the variant alone fails.
+        lost: Pairs of which the baseline alone fails.
+        more: By how much more of the range the variant fails, each point standing for what is
+            nearest to it; along two parameters as a share of the points of the grid. The mean over
+            seeds.
     """
 
-    fails_below: bool
-    changes: int = 1
+    pairs: int
+    gained: int
+    lost: int
+    more: float
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A boundary, or a difference of two, with its interval of 95 %."""
-
-    value: float
-    low: float
-    high: float
-
-
-def next_points(failed: Mapping[int, bool], skipped: set[int]) -> list[int]:
+def next_points(
+    failed: Mapping[int, bool], first: Iterable[int], skipped: set[int] | frozenset[int]
+) -> list[int]:
     """Return the points of the grid that a seed drives next; none where its search has ended.
 
     Args:
         failed: Point -> whether the drive failed there.
+        first: Points that are driven whatever happens.
         skipped: Points at which the scene cannot be built.
     """
-    asked = [point for point in FIRST if point not in skipped]
-    if missing := [point for point in asked if point not in failed]:
-        return missing
-    if len(changes_of({point: failed[point] for point in asked})) != 1:
-        return []
-    if len(failed) > MOST_POINTS - 2 * len(BESIDE):
-        return []
-    changes = changes_of(failed)
-    middles: list[int] = []
-    for low, high in {changes[0], changes[-1]}:
+    missing = [point for point in first if point not in failed and point not in skipped]
+    return missing or middles_of_changes(failed, skipped)
+
+
+def middles_of_changes(failed: Mapping[int, bool], skipped: set[int] | frozenset[int]) -> list[int]:
+    """Return for each change of outcome the point in the middle of its driven neighbours, where there
+    is one that can be built.
+    """
+    middles = []
+    for low, high in changes_of(failed):
         inside = [point for point in range(low + 1, high) if point not in skipped]
-        middles += sorted(inside, key=lambda point: (abs(2 * point - low - high), point))[:1]
-    if middles:
-        return sorted(middles)
-    low = changes[0][0]
-    high = changes[-1][1]
-    beside = [point for step in BESIDE for point in (low - step, high + step)]
-    return [p for p in beside if 0 < p < STEPS and p not in {*failed, *skipped}]
+        if inside:
+            middles.append(min(inside, key=lambda point: (abs(2 * point - low - high), point)))
+    return middles
 
 
 def changes_of(failed: Mapping[int, bool]) -> list[tuple[int, int]]:
@@ -95,54 +102,110 @@ def changes_of(failed: Mapping[int, bool]) -> list[tuple[int, int]]:
     return [(low, high) for low, high in pairwise(points) if failed[low] != failed[high]]
 
 
-def bracket_of(failed: Mapping[int, bool], values: Mapping[int, float]) -> Bracket | str:
-    """Return the bracket of a seed whose search has ended, or why there is none.
+def stretches_of(outcomes: Outcomes) -> list[Stretch]:
+    """Return the stretches of a variant in order, over the points that every seed has driven.
 
     Args:
-        failed: Point -> whether the drive failed there.
-        values: Point -> value of the parameter.
+        outcomes: Of each seed its driven points: value of the parameter, whether it failed.
     """
-    if len(changes_of({point: failed[point] for point in FIRST if point in failed})) > 1:
-        return "not monotone"
-    changes = changes_of(failed)
-    if not changes:
-        return "fails everywhere" if any(failed.values()) else "no failure"
-    low = changes[0][0]
-    high = changes[-1][1]
-    return Bracket(values[low], values[high], failed[low], len(changes))
+    by_seed = [
+        {value: bool(has_failed) for value, has_failed in seed} for seed in outcomes.values()
+    ]
+    shared = sorted(set.intersection(*(set(seed) for seed in by_seed))) if by_seed else []
+    counts = [(value, sum(seed[value] for seed in by_seed)) for value in shared]
+    stretches = []
+    for _, group in groupby(counts, key=lambda pair: (pair[1] > 0) + (pair[1] == len(by_seed))):
+        values, numbers = zip(*group, strict=True)
+        stretches.append(
+            Stretch(values[0], values[-1], len(values), min(numbers), max(numbers), len(by_seed))
+        )
+    return stretches
 
 
-def boundary_of(brackets: Sequence[Interval]) -> Estimate:
-    """Return the mean boundary of several seeds with its interval; of one seed its bracket.
+def widest_gap(outcomes: Outcomes) -> float:
+    """Return the largest distance between neighbouring driven points of any seed."""
+    gaps = [0.0]
+    for points in outcomes.values():
+        gaps += [high - low for low, high in pairwise(sorted(value for value, _ in points))]
+    return max(gaps)
+
+
+def median_boundary(outcomes: Outcomes) -> Interval | None:
+    """Return an interval that holds the median boundary of seeds like these with 95 %, whatever their
+    distribution; None unless each seed changes once, all in the same direction, and there are
+    `seeds_for_median` of them.
+
+    Its ends are order statistics: the r-th lowest and highest of ``n`` values enclose the median
+    unless fewer than r lie on one side of it, which is binomial with a half (David and Nagaraja, Order
+    Statistics, 2003, section 7.1).
+    """
+    brackets = []
+    directions = set()
+    for points in outcomes.values():
+        failed = {value: bool(has_failed) for value, has_failed in points}
+        changes = [
+            (low, high) for low, high in pairwise(sorted(failed)) if failed[low] != failed[high]
+        ]
+        if len(changes) != 1:
+            return None
+        brackets.append(changes[0])
+        directions.add(failed[changes[0][0]])
+    rank = _rank(len(brackets))
+    if len(directions) != 1 or rank == 0:
+        return None
+    lows, highs = (sorted(ends) for ends in zip(*brackets, strict=True))
+    return Interval(lows[rank - 1], highs[-rank])
+
+
+def seeds_for_median() -> int:
+    """Return how many seeds give an interval of their median."""
+    return next(number for number in range(1, 100) if _rank(number) > 0)
+
+
+def _rank(seeds: int) -> int:
+    """Return the order statistic, from either end, at which an interval of the median ends; 0 where
+    there are too few seeds.
+    """
+    outside = 2.0 * scipy.special.bdtr(np.arange(seeds), seeds, 0.5)
+    return int(np.sum(outside <= 1.0 - CONFIDENCE))
+
+
+def difference_of(
+    now: Outcomes, was: Outcomes, first: Sequence[Sequence[float]]
+) -> Difference | None:
+    """Compare two variants at the points that both have driven; None where they share no point.
 
     Args:
-        brackets: One a seed, all of which fail on the same side.
+        now, was: Outcomes of the variant and of its baseline.
+        first: Of each parameter its values at the first points. Of two parameters the points of this
+            grid alone are counted, so that none stands for more than others.
     """
-    return _mean(
-        [one.middle for one in brackets],
-        max(one.half_width for one in brackets),
-    )
+    gained, lost, pairs = 0, 0, 0
+    more = []
+    for seed in sorted(set(now) & set(was)):
+        sides = [
+            {tuple(values): bool(has_failed) for *values, has_failed in side[seed]}
+            for side in (now, was)
+        ]
+        shared = sorted(set(sides[0]) & set(sides[1]))
+        if len(first) == 2:
+            shared = [point for point in shared if point[0] in first[0] and point[1] in first[1]]
+        if not shared:
+            continue
+        change = np.array([int(sides[0][point]) - int(sides[1][point]) for point in shared])
+        pairs += len(shared)
+        gained += int(np.sum(change > 0))
+        lost += int(np.sum(change < 0))
+        if len(first) == 2:
+            more.append(float(np.mean(change)))
+        else:
+            more.append(float(change @ nearest_lengths([value for (value,) in shared])))
+    return Difference(pairs, gained, lost, float(np.mean(more))) if more else None
 
 
-def difference_of(brackets: Sequence[Interval], base: Sequence[Interval]) -> Estimate:
-    """Return the mean difference of the boundaries of two variants, paired by seed.
-
-    Args:
-        brackets: One a seed.
-        base: Those of the baseline, in the same order of seeds.
+def nearest_lengths(values: Sequence[float]) -> F64:
+    """Return the length of the range that is nearest to each of some sorted values: half the distance
+    to each neighbour.
     """
-    pairs = list(zip(brackets, base, strict=True))
-    return _mean(
-        [one.middle - other.middle for one, other in pairs],
-        max(one.half_width + other.half_width for one, other in pairs),
-    )
-
-
-def _mean(values: Sequence[float], half_width: float) -> Estimate:
-    """Return a mean with Student's interval, widened by what the brackets leave open."""
-    mean = float(np.mean(values))
-    margin = half_width
-    if len(values) > 1:
-        quantile = scipy.special.stdtrit(len(values) - 1, 0.5 + 0.5 * CONFIDENCE)
-        margin += float(quantile * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return Estimate(mean, mean - margin, mean + margin)
+    halves = 0.5 * np.diff(np.asarray(values, float))
+    return np.pad(halves, (0, 1)) + np.pad(halves, (1, 0))

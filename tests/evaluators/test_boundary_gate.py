@@ -1,9 +1,10 @@
-"""A gate on boundaries: pass, regression, undecided, and what cannot be compared."""
+"""A gate on boundaries: pass, regression, and what cannot be compared."""
 
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from evaluators.statistics.boundary_gate import boundary_verdict, more_that_fails
+from alpasim_plugin.runs.self_test import run_self_test
+from evaluators.statistics.boundary_gate import boundary_verdict
 from evaluators.statistics.gate import GateSpec, load_gate
 from tests.evaluators.gate_tables import rows, table_of
 
@@ -12,75 +13,104 @@ TABLE = table_of([*rows("clean", 1), *rows("3dgs", 1)])
 GATE = GateSpec(version=1, boundary_margin=0.5)
 
 
-def found(low, high, fails="below"):
-    points = [[4.0, fails == "below"], [low, False], [high, False], [14.0, fails == "above"]]
-    return {"fails": fails, "low": low, "high": high, "outcomes": {"0": points}}
+VALUES = [4.0 + 0.5 * number for number in range(21)]
 
 
-def without(*outcomes):
-    return {"reason": "", "outcomes": {"0": [[4.0 + k, one] for k, one in enumerate(outcomes)]}}
+def fails(*windows):
+    """Return the facts of a variant that fails in windows of the range."""
+    points = [[value, any(low <= value < high for low, high in windows)] for value in VALUES]
+    return {"outcomes": {"0": points}}
 
 
-def area(low, high):
-    points = [[4.0, 1.0, True], [14.0, low, False]]
-    return {"areas": {}, "low": low, "high": high, "outcomes": {"0": points}}
+def area(*failing):
+    points = [[x, y, (x, y) in failing] for x in (4.0, 9.0, 14.0) for y in (1.0, 2.0)]
+    return {"outcomes": {"0": points}}
 
 
-def record(base, variant, difference=None, **more):
-    between = {"baseline": "clean/p"} | dict(zip(("low", "high"), difference or (), strict=False))
+def record(base, variant, **more):
     made = {
         "parameter": "actors.cutter.s_m",
         "unit": "m",
         "reachable": ENDS,
+        "spacing": 0.5,
+        "apart": 0.5,
+        "first": VALUES,
         "stopped": "",
         "variants": {"clean/p": base, "3dgs/p": variant},
-        "differences": {"3dgs/p": between} if difference else {},
     }
     return made | more
 
 
 @pytest.mark.parametrize(
-    ("base", "variant", "difference", "code"),
+    ("base", "variant", "code"),
     [
-        (found(6.0, 6.2), found(6.1, 6.3), (-0.1, 0.3), 0),
-        (found(6.0, 6.2), found(7.0, 7.2), (0.8, 1.2), 1),
-        (found(6.0, 6.2), found(6.4, 6.6), (0.2, 0.6), 3),
-        (found(7.0, 7.2), found(4.5, 4.7), (-2.7, -2.3), 0),
-        (found(9.0, 9.2, "above"), found(7.0, 7.2, "above"), (-2.2, -1.8), 1),
-        (found(6.0, 8.0), found(6.0, 8.0), (-2.0, 2.0), 0),  # equal outcomes
-        (found(6.0, 6.2), without(False, False), None, 0),
-        (without(False, False), found(6.0, 6.2), None, 1),
-        (found(6.0, 6.2), without(True, True), None, 1),
-        (found(6.0, 6.2), without(True, False, True), None, 3),
-        (area(0.1, 0.2), area(0.3, 0.4), (0.6, 0.7), 1),
-        (area(0.1, 0.2), area(0.3, 0.4) | {"areas": {}}, None, 0),
+        (fails((4, 7)), fails((4, 7)), 0),
+        (fails((4, 7)), fails((4, 7.5)), 0),  # 0.5 m is the margin
+        (fails((4, 7)), fails((4, 8)), 1),
+        (fails((4, 8)), fails((4, 5)), 0),
+        (fails((9, 15)), fails((7, 15)), 1),
+        (fails((4, 7)), fails((4, 7), (8.5, 9.5)), 1),  # a window beside an equal boundary
+        (fails((4, 7), (8.5, 9.5)), fails((4, 7)), 0),
+        (fails(), fails((4, 6)), 1),
+        (fails(), fails((0, 20)), 1),
     ],
 )
-def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, difference, code):
-    verdict = boundary_verdict(TABLE, GATE, record(base, variant, difference))
+def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, code):
+    verdict = boundary_verdict(TABLE, GATE, record(base, variant))
     assert verdict.exit_code == code
-    assert [check.renderer for check in verdict.checks] == ["3dgs"]
+    (check,) = verdict.checks
+    assert check.renderer == "3dgs"
+    assert "points 0.5 m apart, a narrower change is not seen" in check.text
+
+
+def test_of_a_rectangle_points_of_the_grid_are_counted():
+    two = {
+        "parameter": ["a", "b"],
+        "unit": ["m", "m/s"],
+        "reachable": [ENDS, [1.0, 2.0]],
+        "spacing": [5.0, 1.0],
+        "first": [[4.0, 9.0, 14.0], [1.0, 2.0]],
+    }
+    spec = GateSpec(version=1, boundary_margin=0.2)
+    base = area((4.0, 1.0))
+    for failing, code in (((4.0, 1.0), (9.0, 1.0)), 0), (((4.0, 1.0), (9.0, 1.0), (9.0, 2.0)), 1):
+        variant = area(*failing)
+        variant["outcomes"]["0"].append([6.5, 1.0, True])  # between points of the grid
+        verdict = boundary_verdict(TABLE, spec, record(base, variant, **two))
+        assert verdict.exit_code == code
+    assert "of 6" in verdict.checks[0].text
+    assert "5 m by 1 m/s apart" in verdict.checks[0].text
 
 
 def test_an_earlier_run_is_compared_variant_by_variant():
-    now = record(found(6.0, 6.2), found(7.0, 7.2), (0.8, 1.2))
-    was = record(found(6.0, 6.2), found(6.0, 6.2), (-0.2, 0.2))
+    now = record(fails((4, 7)), fails((4, 8)))
+    was = record(fails((4, 7)), fails((4, 7)))
     verdict = boundary_verdict(TABLE, GATE, now, was, "before")
     assert {check.renderer: check.cause for check in verdict.checks} == {
         "clean": "pass",
         "3dgs": "regression",
     }
-    assert more_that_fails(found(7.0, 7.2), found(6.0, 6.2), ENDS) == pytest.approx((0.8, 1.2))
 
 
 def test_what_cannot_be_compared_is_bad_input():
-    good = record(found(6.0, 6.2), found(6.1, 6.3))
+    good = record(fails((4, 7)), fails((4, 7)))
     assert boundary_verdict(TABLE, GATE, good | {"stopped": "here"}).exit_code == 2
-    for now, was in ((None, None), (good, {}), (good, good | {"reachable": [4.0, 12.0]})):
+    other_seed = {"outcomes": {"5": fails()["outcomes"]["0"]}}
+    assert boundary_verdict(TABLE, GATE, record(fails(), other_seed)).exit_code == 2
+    older = {name: good[name] for name in good if name != "first"}
+    elsewhere = good | {"reachable": [4.0, 12.0]}
+    coarser = good | {"spacing": 1.0}
+    for now, was in ((None, None), (good, {}), (good, older), (good, elsewhere), (good, coarser)):
         with pytest.raises(InputError):
             boundary_verdict(TABLE, GATE, now, was, "before")
     with pytest.raises(InputError):
         boundary_verdict(table_of(rows("clean", 1)), GATE, good)
+
+
+def test_the_self_test_refuses_a_gate_whose_points_it_does_not_drive(tmp_path):
+    with pytest.raises(InputError, match="boundary_margin"):
+        run_self_test(GATE, tmp_path, ["simrun"], None)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,16 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
+from alpasim_plugin.log.run_folder.records import MetricValue
 from alpasim_plugin.log.run_folder.schema import SUMMARY
-from alpasim_plugin.runs.vary import Sweep
+from alpasim_plugin.runs.vary import Sweep, has_failed
 
 DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1", "--images", "none"]
 PLAIN = ["--set", "environment.buildings=0"]
@@ -31,12 +33,14 @@ def searched(tmp_path_factory):
 def test_the_boundary_of_a_gap_is_found_with_few_rollouts(searched):
     root, found = searched
     facts = found["variants"]["clean/pure-pursuit"]
-    assert facts["fails"] == "below"
-    assert facts["high"] - facts["low"] == pytest.approx(20 / 64)
-    assert 21 < facts["value"] < 24
-    assert found["rollouts"] == len(facts["outcomes"]["0"]) <= 0.4 * found["grid_rollouts"]
+    fails, holds = facts["stretches"]
+    assert (fails["low"], holds["high"]) == (10, 30)
+    assert holds["low"] - fails["high"] == pytest.approx(20 / 64)
+    assert 21 < fails["high"] < 24
+    assert found["apart"] == found["spacing"] == 20 / 16
+    assert found["rollouts"] == len(facts["outcomes"]["0"]) == 17 + 2
     for name in ("report.html", "summary.md"):
-        assert "fails below" in (root / name).read_text()
+        assert "pure-pursuit fails from 10 to" in (root / name).read_text()
 
 
 @pytest.mark.slow
@@ -52,7 +56,7 @@ def test_an_interrupted_search_continues_to_the_same_boundary(searched, tmp_path
 @pytest.mark.slow
 def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_path):
     found = drive(tmp_path / "run", "--vary", "actors.cutter.s_m=35..2000")
-    assert "no failure" in found["variants"]["clean/pure-pursuit"]["reason"]
+    assert "no failure from 35 to" in found["sentence"]
     assert found["reachable"][1] < 2000
     assert found["unreachable"]
     assert "cannot be built" in found["sentence"]
@@ -71,6 +75,9 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
         ("actors.cutter.s_m=a..b", "a..b"),
         ("actors.cutter.at_us=0..3", "0..3"),  # four values
         ("version=1..2", "version"),  # built at one of them
+        ("actors.cutter.s_m=4..14/0", "step of 0"),
+        ("actors.cutter.s_m=4..14/20", "step of 20"),
+        ("actors.cutter.s_m=4..14/fine", "fine"),
         ("actors.cutter.s_m", "actors.cutter.s_m"),
         ("seed=0..64", "seed"),
         ("ego.lane=0..1", "lane"),  # a whole number
@@ -113,3 +120,26 @@ def test_times_stay_whole():
     assert all(value.is_integer() for value in sweep.values)
     with pytest.raises(InputError):
         Sweep.parse("ego.speed_mps=nan..3")
+
+
+def test_a_step_is_the_largest_distance_of_first_points():
+    sweep = Sweep.parse("actors.cutter.s_m=4..14/3")
+    assert [sweep.values[step] for step in sweep.first] == [4, 6.5, 9, 11.5, 14]
+    sweep = Sweep.parse("actors.cutter.s_m=-3..4/0.1")
+    assert (sweep.spacings, len(sweep.first)) == (70, 71)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "failed"),
+    [("ended_in_danger", 1.0, True), ("stalled", 1.0, True), ("collision_any", 0.0, False)],
+)
+def test_every_outcome_of_a_drive_is_a_failure_of_a_point(name, value, failed):
+    values = {"collision_any": 0.0, "offroad": 0.0} | {name: value}
+    manifest = SimpleNamespace(
+        ok=True,
+        metrics={
+            metric: MetricValue(number, True, "", "", "lower") for metric, number in values.items()
+        },
+    )
+    assert has_failed(manifest) is failed
+    assert has_failed(SimpleNamespace(ok=True, metrics={})) is None

@@ -1,0 +1,25 @@
+"""Words for what driven points say, which the gate and pages share."""
+
+from alpasim_plugin.core.json_types import JsonView
+from evaluators.statistics.numbers import fixed, plural
+
+
+def apart_text(record: JsonView) -> str:
+    """Write how far apart the first points stand, such as ``0.5 m`` or ``1 m by 0.5 m/s``.
+
+    Args:
+        record: The member ``boundary`` of ``summary.json``.
+    """
+    if isinstance(record["unit"], list):
+        sides = zip(record["spacing"], record["unit"], strict=True)
+        return " by ".join(f"{spacing:.4g} {unit}".rstrip() for spacing, unit in sides)
+    return f"{record['apart']:.4g} {record['unit']}".rstrip()
+
+
+def difference_text(difference: JsonView, unit: str) -> str:
+    """Say by how much more of a range a variant fails than its baseline, and at which points."""
+    return (
+        f"fails over {fixed(difference['more'], 2, sign=True)}{unit} more: of "
+        f"{plural(difference['pairs'], 'paired drive')} {difference['gained']} fail anew and "
+        f"{difference['lost']} no longer"
+    )
