@@ -2,6 +2,8 @@
 
 import ast
 
+import pytest
+
 from tests.source_modules import modules
 
 PRONOUNS = frozenset(
@@ -30,25 +32,17 @@ PRONOUNS = frozenset(
         "aside",
     ]
 )
-# Share of all bindings that may still be pronouns: options of the contract (`--at`), and places that
-# nobody has read again yet.
-MOST = 0.005
-# Rooms without any.
-CLEAN = (
-    "alpasim_plugin.alpasim",
-    "alpasim_plugin.block_fixers",
-    "alpasim_plugin.cameras",
-    "alpasim_plugin.control",
-    "alpasim_plugin.core",
-    "alpasim_plugin.drives",
-    "alpasim_plugin.gym",
-    "alpasim_plugin.renderers",
-    "alpasim_plugin.runs",
-    "alpasim_plugin.streets",
-    "alpasim_plugin.world",
-    "policies",
-    "scenarios",
-)
+# Module -> names of the contract that are pronouns: options of the command line, keys of files that
+# are written, and settings of a training's configuration.
+CONTRACT = {
+    "alpasim_plugin.cli.fork": {"at", "own"},
+    "alpasim_plugin.log.run_folder.records": {"what", "of", "asked"},
+    "alpasim_plugin.lab.training.distillation": {"every"},
+    "alpasim_plugin.lab.training.model_card": {"what"},
+    "alpasim_plugin.lab.training.photograph_pairs": {"every"},
+}
+# The room that still has some, and how many: none may come.
+UNREAD = {"evaluators.statistics": 48}
 
 
 def of_short_comprehensions(tree_nodes):
@@ -76,15 +70,33 @@ def bindings(module):
 
 
 def pronouns(module):
-    return [f"{module.name}:{line} {name}" for name, line in bindings(module) if name in PRONOUNS]
+    allowed = CONTRACT.get(module.name, set())
+    return [
+        f"{module.name}:{line} {name}"
+        for name, line in bindings(module)
+        if name in PRONOUNS - allowed
+    ]
 
 
-def test_few_names_are_pronouns_or_participles():
-    count = sum(len(list(bindings(module))) for module in modules())
-    wrong = [line for module in modules() for line in pronouns(module)]
-    assert len(wrong) <= MOST * count, f"{len(wrong)} of {count}, {wrong[:20]}"
-
-
-def test_rooms_that_are_free_of_pronouns_stay_so():
-    rooms = [module for module in modules() if module.name.startswith(CLEAN)]
+def test_names_are_no_pronouns_or_participles():
+    unread = tuple(f"{room}." for room in UNREAD)
+    rooms = [module for module in modules() if not f"{module.name}.".startswith(unread)]
     assert [line for module in rooms for line in pronouns(module)] == []
+
+
+@pytest.mark.parametrize("room", UNREAD)
+def test_no_pronoun_comes_to_a_room_that_still_has_some(room):
+    lines = [
+        line
+        for module in modules()
+        if f"{module.name}.".startswith(f"{room}.")
+        for line in pronouns(module)
+    ]
+    assert len(lines) <= UNREAD[room], lines
+
+
+def test_every_name_that_is_excepted_is_bound():
+    bound = {module.name: {name for name, _ in bindings(module)} for module in modules()}
+    # the laboratory is a distribution of its own
+    missing = {name: names - bound[name] for name, names in CONTRACT.items() if name in bound}
+    assert {name: names for name, names in missing.items() if names} == {}

@@ -127,7 +127,7 @@ def _mean_lines(run: Run, metric_table: MetricTable, all_metrics: bool) -> list[
     """
     lines = list(first_screen(run))
     if all_metrics:
-        lines += metric_lines(run.summary, known=metric_table)
+        lines += metric_lines(run.summary, table=metric_table)
     failures = run.summary.failures
     if failures.n_failed:
         causes = ", ".join(f"{name} {count}" for name, count in failures.by_class.items())

@@ -92,12 +92,12 @@ def view(
         "page": str(page),
         "bytes": made.size,
         "cells": [
-            {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.shown
+            {"scene": cell.scene, "policy": cell.policy, "seed": cell.seed} for cell in made.cells
         ],
-        "of": len(made.known),
+        "of": len(made.all_cells),
         "notes": list(made.notes),
     }
-    size = f"{made.size / MB:.1f} MB, {len(made.shown)} of {len(made.known)} rollouts"
+    size = f"{made.size / MB:.1f} MB, {len(made.cells)} of {len(made.all_cells)} rollouts"
     lines = [
         *(f"note     {note}" for note in made.notes),
         f"page     {shlex.quote(str(page))}, {size}",
@@ -168,5 +168,5 @@ def report(
     facts = {"report": str(page), "summary": to_json(opened.summary)}
     lines = first_screen(opened)
     if all_metrics:
-        lines += ["", *metric_lines(opened.summary, known=opened.table)]
+        lines += ["", *metric_lines(opened.summary, table=opened.table)]
     show(as_json, facts, *lines, f"report   {page}")

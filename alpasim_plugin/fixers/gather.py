@@ -256,7 +256,7 @@ def _place_row(upper, lower, share_down, y, height, place, shares):
         place: ``(4, W)`` uint32, written: indices into the flat reference.
         shares: ``(4, W)`` float32, written.
     """
-    one = np.float32(1.0)
+    unit = np.float32(1.0)
     zero = np.float32(0.0)
     width = place.shape[1]
     for x in range(width):
@@ -271,7 +271,7 @@ def _place_row(upper, lower, share_down, y, height, place, shares):
         shares[3, x] = to_below * to_right
         shares[1, x] = to_right - shares[3, x]
         shares[2, x] = to_below - shares[3, x]
-        shares[0, x] = one - to_right - shares[2, x]
+        shares[0, x] = unit - to_right - shares[2, x]
         next_column = min(left + 1, width - 1) - left
         next_row = (min(top + 1, height - 1) - top) * width
         first = top * width + left

@@ -22,7 +22,7 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
-from alpasim_plugin.log.run_folder.rows import Own, Rollout, series_by_cell
+from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, series_by_cell
 from evaluators.pages.cells import Logs, WatchedCell
 from evaluators.pages.images import NO_FRAMES, Source, sources
 from evaluators.pages.rollouts import events_of
@@ -279,7 +279,7 @@ def _boxes(renderer: str, log: RolloutLog, label: str, color: Rgb) -> Iterator[I
         before = present
 
 
-def _metrics(metrics: Own, label: str) -> Iterator[Item]:
+def _metrics(metrics: CellSeries, label: str) -> Iterator[Item]:
     """Yield one message an instant with the metrics that are valid then; a metric that is not has
     no value, never zero.
     """

@@ -204,7 +204,7 @@ def _write_aggregate(
     settings: EvalSettings,
 ) -> list[str]:
     """Write AlpaSim's files and return their names; without ``marks`` no summary."""
-    scored_rollouts = [one.of for one in reduced]
+    scored_rollouts = [rollout.scored for rollout in reduced]
     sweeps = over_sweeps(reduced)
     write_parquet(
         folder / "metrics_unprocessed.parquet", metrics_unprocessed_table(scored_rollouts)

@@ -43,7 +43,7 @@ class ScoredRollout:
 class ReducedRollout:
     """Its values; metrics of the run that this rollout does not have are None."""
 
-    of: ScoredRollout
+    scored: ScoredRollout
     reduction: Reduction
 
     @property
@@ -84,22 +84,24 @@ def reduce_run(rollouts: Sequence[ScoredRollout], preset: Preset) -> list[Reduce
 def _reduce(
     rollout: ScoredRollout, names: Mapping[str, MetricInfo], preset: Preset
 ) -> ReducedRollout:
-    own = {metric_series.name for metric_series in rollout.series}
+    series_names = {metric_series.name for metric_series in rollout.series}
     line = next(
         metric_series.t_us
         for metric_series in rollout.series
         if metric_series.name == "eval_relevant"
     )
     added = []
-    if "offroad" not in own:
-        known = "offroad" not in names
-        added.append(series("offroad", line, 0.0 if known else np.nan, known, WITHOUT_MAP))
+    if "offroad" not in series_names:
+        none_has_map = "offroad" not in names
+        added.append(
+            series("offroad", line, 0.0 if none_has_map else np.nan, none_has_map, WITHOUT_MAP)
+        )
     reduction = reduce_rollout([*rollout.series, *added], preset)
     values = dict(reduction.values)
     if added and "offroad" not in names:
         del values["offroad"]
     for name, metric in names.items():
-        if name not in own:
+        if name not in series_names:
             facts = values.get(name) or MetricValue(None, False, "", metric.unit, metric.direction)
             values[name] = replace(
                 facts,
@@ -130,16 +132,16 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
     # Each rollout's rank among the names of its scene, dropped ones included.
     names: dict[str, list[str]] = {}
     for rollout in rollouts:
-        names.setdefault(rollout.of.scene, []).append(rollout.of.rollout)
-    for scene, own in names.items():
-        twice = next((name for name in own if own.count(name) > 1), None)
+        names.setdefault(rollout.scored.scene, []).append(rollout.scored.rollout)
+    for scene, scene_rollouts in names.items():
+        twice = next((name for name in scene_rollouts if scene_rollouts.count(name) > 1), None)
         if twice is not None:
             raise InputError(
                 f"scene {scene!r}: two rollouts named {twice!r}",
                 "score the runs apart, or rename the folder of one log",
             )
-        own.sort()
-    ranks = [names[rollout.of.scene].index(rollout.of.rollout) for rollout in rollouts]
+        scene_rollouts.sort()
+    ranks = [names[rollout.scored.scene].index(rollout.scored.rollout) for rollout in rollouts]
     kept = [
         (rank, rollout.values)
         for rank, rollout in zip(ranks, rollouts, strict=True)
@@ -271,10 +273,15 @@ def metrics_unprocessed_table(rollouts: Sequence[ScoredRollout]) -> pa.Table:
     rows = []
     for rollout in rollouts:
         ids = (rollout.scene, rollout.rollout, rollout.run_uuid, rollout.run_name)
-        for one in rollout.series:
-            steps = zip(one.t_us.tolist(), one.value.tolist(), one.valid.tolist(), strict=True)
+        for metric_series in rollout.series:
+            steps = zip(
+                metric_series.t_us.tolist(),
+                metric_series.value.tolist(),
+                metric_series.valid.tolist(),
+                strict=True,
+            )
             for step in list(steps) or [(None, None, None)]:
-                row = (one.name, *step, one.metric.aggregation, *ids)
+                row = (metric_series.name, *step, metric_series.metric.aggregation, *ids)
                 rows.append(dict(zip(STEPS.names, row, strict=True)))
     return pa.Table.from_pylist(rows, STEPS)
 
@@ -312,13 +319,15 @@ def results_summary(
         sweeps: What `over_sweeps` gave.
         settings: Of the scene score.
     """
-    run_uuid = combined_run_uuid([rollout.of for rollout in rollouts])
+    run_uuid = combined_run_uuid([rollout.scored for rollout in rollouts])
     later = any("left_corridor_laterally" in rollout.values for rollout in rollouts)
-    shown = LATER_SCORE_METRICS if later else SCORE_METRICS
+    score_metrics = LATER_SCORE_METRICS if later else SCORE_METRICS
     counted = [(i, rollout) for i, rollout in enumerate(rollouts) if not rollout.dropped]
     entries = [
-        _entry(rollout, scores.get(i), run_uuid, shown)
-        for i, rollout in sorted(counted, key=lambda item: (item[1].of.scene, item[1].of.rollout))
+        _entry(rollout, scores.get(i), run_uuid, score_metrics)
+        for i, rollout in sorted(
+            counted, key=lambda item: (item[1].scored.scene, item[1].scored.rollout)
+        )
     ]
     for failure in failed:
         ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
@@ -333,11 +342,11 @@ def results_summary(
             entry |= {
                 "score": 0.0,
                 "score_metrics": {
-                    name: 0.0 if name == "progress_score" else None for name in shown
+                    name: 0.0 if name == "progress_score" else None for name in score_metrics
                 },
             }
         entries.append(entry)
-    name = rollouts[0].of.run_name if rollouts else None
+    name = rollouts[0].scored.run_name if rollouts else None
     saturation = settings.progress_saturation_threshold
     least = settings.min_gt_distance_for_full_score_m
     overall: JsonObject = {key: _number(value) for key, value in sweeps.items()}
@@ -360,25 +369,25 @@ def results_summary(
 
 
 def _entry(
-    rollout: ReducedRollout, score: SceneScore | None, run_uuid: str, shown: Sequence[str]
+    rollout: ReducedRollout, score: SceneScore | None, run_uuid: str, score_metrics: Sequence[str]
 ) -> JsonObject:
     ids = {
         "run_uuid": run_uuid,
-        "run_name": rollout.of.run_name,
-        "clipgt_id": rollout.of.scene,
-        "rollout_id": rollout.of.rollout,
+        "run_name": rollout.scored.run_name,
+        "clipgt_id": rollout.scored.scene,
+        "rollout_id": rollout.scored.rollout,
     }
     values = {name: _number(value) for name, value in rollout.values.items()}
     entry: JsonObject = {"status": "unscored"}
     entry |= dict.fromkeys(("passed", "score", "failure_reason", "score_metrics"))
     if score is not None:
-        known = values | {"progress_score": score.progress_score}
+        values_with_progress = values | {"progress_score": score.progress_score}
         entry = {
             "status": "pass" if score.passed else "fail",
             "passed": score.passed,
             "score": score.score,
             "failure_reason": score.failure_reason,
-            "score_metrics": {name: known.get(name) for name in shown},
+            "score_metrics": {name: values_with_progress.get(name) for name in score_metrics},
         }
     return ids | entry | {"metrics": values | ids}
 

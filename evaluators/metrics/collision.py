@@ -155,7 +155,7 @@ def _at_fault(drive: ScoredRollout, actor: I64, side: I64, step: I64) -> Bool:
     touches what stands, or somebody with its front, or at its side while no lane holds it.
     """
     tracks = drive.tracks
-    stands = tracks.there[actor, step] & (tracks.speed[actor, step] <= nuplan.STOPPED_MPS)
+    stands = tracks.is_present[actor, step] & (tracks.speed[actor, step] <= nuplan.STOPPED_MPS)
     between = (side == LATERAL) & (False if drive.astray is None else drive.astray[step])
     guilty = stands | (side == FRONT) | between
     return guilty & (drive.ego.speed[step] > nuplan.STOPPED_MPS)

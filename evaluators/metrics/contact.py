@@ -288,12 +288,14 @@ def _place(pairs: Motions, tau: F64) -> tuple[I64, F64]:
     """
     center = pairs.start + tau[:, None] * pairs.shift
     yaw = pairs.yaw + tau[:, None] * pairs.turn
-    seen = in_axes(center, yaw[:, 0])
+    centre_in_box = in_axes(center, yaw[:, 0])
     half = pairs.half[:, 0]
     flat = np.zeros(len(tau))
-    own = shapely.polygons(rectangle_corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
-    other = shapely.polygons(rectangle_corners(seen, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1]))
-    shared = shapely.intersection(own, other)
+    ego_box = shapely.polygons(rectangle_corners(np.zeros_like(half), flat, 2 * (half + PLACE_M)))
+    other_box = shapely.polygons(
+        rectangle_corners(centre_in_box, yaw[:, 1] - yaw[:, 0], 2 * pairs.half[:, 1])
+    )
+    shared = shapely.intersection(ego_box, other_box)
     middle = shapely.get_coordinates(shapely.centroid(shared)).reshape(-1, 2)
     gap = gaps(pairs, tau)  # (M, 8)
     turned = pairs.yaw[:, 1] - pairs.yaw[:, 0] + tau * (pairs.turn[:, 1] - pairs.turn[:, 0])

@@ -22,8 +22,8 @@ def decode(image: LoggedImage) -> U8:
     """
     from alpasim_plugin.core.files.images import decode_image
 
-    where = f"camera {image.camera!r} at {image.end_us} us"
-    return decode_image(image.data, where, "log PNG or JPEG")
+    location = f"camera {image.camera!r} at {image.end_us} us"
+    return decode_image(image.data, location, "log PNG or JPEG")
 
 
 def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:

@@ -39,8 +39,10 @@ def safe_distance_m(v_mps: F64, ahead_mps: F64) -> F64:
     28.28125
     """
     after = v_mps + RESPONSE_S * RSS_ACCEL_MPS2
-    own = v_mps * RESPONSE_S + RSS_ACCEL_MPS2 * RESPONSE_S**2 / 2 + after**2 / (2 * RSS_BRAKE_MPS2)
-    return np.maximum(own - np.maximum(ahead_mps, 0.0) ** 2 / (2 * RSS_MOST_BRAKE_MPS2), 0.0)
+    stopping_m = (
+        v_mps * RESPONSE_S + RSS_ACCEL_MPS2 * RESPONSE_S**2 / 2 + after**2 / (2 * RSS_BRAKE_MPS2)
+    )
+    return np.maximum(stopping_m - np.maximum(ahead_mps, 0.0) ** 2 / (2 * RSS_MOST_BRAKE_MPS2), 0.0)
 
 
 def time_to_collision_s(ego: EgoStates, tracks: Tracks) -> F64:
@@ -48,7 +50,7 @@ def time_to_collision_s(ego: EgoStates, tracks: Tracks) -> F64:
     side, if all go straight on at their velocity; 0 while it does, infinite where it never will.
     """
     out = np.full(len(ego.t_us), np.inf)
-    actor, step = np.nonzero(tracks.there)
+    actor, step = np.nonzero(tracks.is_present)
     first_s, last_s = nuplan.touching_s(ego, tracks, actor, step)
     meets = (first_s <= last_s) & (last_s >= 0.0)
     np.minimum.at(out, step[meets], np.maximum(first_s[meets], 0.0))
@@ -75,7 +77,7 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     margin_m = gap_m - safe_distance_m(
         np.broadcast_to(np.maximum(ego.velocity[:, 0], 0.0), gap_m.shape), ahead_mps
     )
-    counts = tracks.there & (along > 0) & (lateral < ego.size[1] / 2 + length * s + width * c)
+    counts = tracks.is_present & (along > 0) & (lateral < ego.size[1] / 2 + length * s + width * c)
     return np.where(counts, margin_m, np.inf).min(axis=0, initial=np.inf)
 
 

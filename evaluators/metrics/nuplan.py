@@ -86,7 +86,7 @@ def collisions(ego: EgoStates, tracks: Tracks, astray: Bool | None = None) -> li
     radius = boxes.radius_m
     apart = np.hypot(*np.moveaxis(tracks.xy - ego.centre, -1, 0))
     actor, step = np.nonzero(
-        tracks.there & (apart <= radius + np.hypot(*tracks.size.T)[:, None] / 2)
+        tracks.is_present & (apart <= radius + np.hypot(*tracks.size.T)[:, None] / 2)
     )
     touches = shapely.intersects(boxes.take(step).shapes(), tracks.boxes(actor, step).shapes())
     actor = actor[touches]
@@ -148,7 +148,7 @@ def time_to_collision(
         step_s, horizon_s: Times that are looked at: multiples of the step before the horizon.
     """
     out = np.full(len(ego.t_us), np.inf)
-    counts = tracks.there & (ego.speed > STANDS_MPS)
+    counts = tracks.is_present & (ego.speed > STANDS_MPS)
     for collision in collisions:
         counts[collision.actor, collision.step :] = False
     actor, step = np.nonzero(counts)
@@ -187,8 +187,9 @@ def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F
     for yaw in (yaws[0], yaws[0] + np.pi / 2, yaws[1], yaws[1] + np.pi / 2):
         axis = np.cos(yaw), np.sin(yaw)
         reach = sum(
-            np.abs(size[:, 0] * np.cos(yaw - own) / 2) + np.abs(size[:, 1] * np.sin(yaw - own) / 2)
-            for own, size in zip(yaws, sizes, strict=True)
+            np.abs(size[:, 0] * np.cos(yaw - body_yaw) / 2)
+            + np.abs(size[:, 1] * np.sin(yaw - body_yaw) / 2)
+            for body_yaw, size in zip(yaws, sizes, strict=True)
         )
         distance, rate = (
             axis[0] * vector[:, 0] + axis[1] * vector[:, 1] for vector in (apart, gone)

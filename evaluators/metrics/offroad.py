@@ -124,16 +124,16 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
         ]
     held = containment(road, ego, xyz)
     off = np.zeros(len(t_us), np.bool_)
-    known = held.in_one | held.in_union
-    undecided = np.flatnonzero(~known)
+    is_decided = held.in_one | held.in_union
+    undecided = np.flatnonzero(~is_decided)
     if len(road.edges) and len(undecided):
         off[undecided] = road.touches_edge(ego.take(undecided).shapes(), xyz[undecided])
-        known[undecided] = True
-    if preset.missing_road == "absent" and not known.all():
+        is_decided[undecided] = True
+    if preset.missing_road == "absent" and not is_decided.all():
         return []
     against = wrong_lane(road, held.near, ego.centres(), yaw_from_quat(rollout.ego.quat), preset)
     return [
-        series("offroad", t_us, off, known, NO_EDGES),
+        series("offroad", t_us, off, is_decided, NO_EDGES),
         series("wrong_lane", t_us, against),
         series("min_distance_to_lane_boundary_m", t_us, held.boundary_gap_m),
     ]

@@ -266,10 +266,12 @@ def _slow(
     stands = engaged & (v < STAND_MPS)
     slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
     ahead = np.zeros(len(t_us), np.bool_)
-    asked = np.flatnonzero(
+    steps_before_slow = np.flatnonzero(
         _recently((stands | slow)[::-1], -seconds[::-1])[::-1]
     )  # what comes before a slow step may excuse it
-    ahead[asked] = actor_ahead(rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, asked)
+    ahead[steps_before_slow] = actor_ahead(
+        rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, steps_before_slow
+    )
     excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
     stood_s = _lasting(stands & ~excused, seconds)
     slow_s = _lasting(slow & ~excused, seconds)

@@ -179,12 +179,12 @@ def min_ade(
     line_us = rollout.ego.t_us
     usable = line_us[(line_us >= target.t_us[0]) & (line_us <= target.t_us[-1])]
     target_xyz = held(interpolate(target, usable)[:, :3, 3], preset) - origin
-    asked = [plan for plan in plans if plan.samples]
-    now_us = np.array([plan.now_us for plan in asked], np.int64)
+    sampled_plans = [plan for plan in plans if plan.samples]
+    now_us = np.array([plan.now_us for plan in sampled_plans], np.int64)
     if preset.min_ade_rule == "by_index":
-        return _min_ade_by_index(rollout, asked, usable, target_xyz, preset, origin)
-    values = np.full((len(asked), len(preset.min_ade_horizons_s)), np.nan)
-    for i, plan in enumerate(asked):
+        return _min_ade_by_index(rollout, sampled_plans, usable, target_xyz, preset, origin)
+    values = np.full((len(sampled_plans), len(preset.min_ade_horizons_s)), np.nan)
+    for i, plan in enumerate(sampled_plans):
         samples = trajectory_table(plan.samples, rollout.T_rig_box, origin, preset)
         first = int(np.searchsorted(usable, plan.query_us))
         for j, horizon_s in enumerate(preset.min_ade_horizons_s):
@@ -208,7 +208,7 @@ def _min_ade_names(preset: Preset) -> list[str]:
 
 def _min_ade_by_index(
     rollout: RolloutLog,
-    asked: Sequence[LoggedPlan],
+    plans: Sequence[LoggedPlan],
     line_us: I64,
     target_xyz: F64,
     preset: Preset,
@@ -223,13 +223,13 @@ def _min_ade_by_index(
     """
     rows: list[list[tuple[int, float]]] = [[] for _ in preset.min_ade_horizons_s]
     longest_us = max(preset.min_ade_horizons_s) * 1e6
-    for plan in asked:
+    for plan in plans:
         samples = trajectory_table(plan.samples, rollout.T_rig_box, origin, preset)
         until = min(plan.now_us + longest_us, float(line_us[-1]))
         span = np.flatnonzero((line_us >= plan.query_us) & (line_us <= until))
-        found = _errors(samples, line_us[span], target_xyz[span], preset)
-        covering = [error for error in found if error is not None]
-        if len(covering) < len(found):
+        sample_errors = _errors(samples, line_us[span], target_xyz[span], preset)
+        covering = [error for error in sample_errors if error is not None]
+        if len(covering) < len(sample_errors):
             return []
         errors = np.stack(covering)
         running = np.cumsum(errors, axis=1) / np.arange(1, len(span) + 1)

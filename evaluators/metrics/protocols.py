@@ -197,10 +197,10 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
     values: dict[str, Part] = {}
     for name, rule in RULES[benchmark].items():
         # Without a value, it is the parts that would decide the score.
-        known = {part: value for part, value in parts.items() if not isinstance(value, str)}
+        numbers = {part: value for part, value in parts.items() if not isinstance(value, str)}
         missing = {part: reason for part, reason in parts.items() if isinstance(reason, str)}
-        full_marks = known | dict.fromkeys(missing, 1.0)
-        least = rule(known | dict.fromkeys(missing, 0.0))
+        full_marks = numbers | dict.fromkeys(missing, 1.0)
+        least = rule(numbers | dict.fromkeys(missing, 0.0))
         most = rule(full_marks)
         reasons = [
             reason for part, reason in missing.items() if rule(full_marks | {part: 0.0}) < most
@@ -209,10 +209,10 @@ def evaluate_protocol(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         values |= {name: score, f"{name}_least": least, f"{name}_most": most}
     out = []
     for name, value in (values | parts).items():
-        is_known = not isinstance(value, str)
-        number = value if is_known else np.nan
+        is_measured = not isinstance(value, str)
+        number = value if is_measured else np.nan
         reason = f"not measured: {value}"
-        out.append(series(f"{benchmark}_{name}", ego.t_us, number, is_known, reason))
+        out.append(series(f"{benchmark}_{name}", ego.t_us, number, is_measured, reason))
     return out
 
 

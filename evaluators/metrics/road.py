@@ -86,8 +86,8 @@ class Polylines:
         for i, near in enumerate(self.vertex_within(xyz, LEVEL_RADIUS_M)):
             best_m = np.inf
             for line in np.flatnonzero(near):
-                own = self.vertices[start[line] : start[line + 1]]
-                beside = own[np.argmin(np.hypot(*(own[:, :2] - xyz[i, :2]).T))]
+                vertices = self.vertices[start[line] : start[line + 1]]
+                beside = vertices[np.argmin(np.hypot(*(vertices[:, :2] - xyz[i, :2]).T))]
                 away_m = float(np.linalg.norm(beside - xyz[i]))
                 if abs(beside[2] - xyz[i, 2]) <= height_m and away_m < best_m:
                     out[i], best_m = line, away_m
@@ -125,9 +125,9 @@ class Road:
         """Return the prepared areas ``(M,)`` of lanes ``(M,)``; a drive comes near few lanes of a
         map, so they are built when asked for.
         """
-        asked = np.zeros(len(self._lanes), np.bool_)
-        asked[lane] = True
-        new = [k for k in np.flatnonzero(asked).tolist() if self._areas[k] is None]
+        is_needed = np.zeros(len(self._lanes), np.bool_)
+        is_needed[lane] = True
+        new = [k for k in np.flatnonzero(is_needed).tolist() if self._areas[k] is None]
         if new:
             for k in new:
                 self._areas[k] = lane_polygon(
@@ -185,10 +185,12 @@ class Road:
         """Return a lane with those that lead into it and that it leads to; a seam between them is
         no border.
         """
-        own = self._lanes[lane]
+        lane_data = self._lanes[lane]
         chosen = np.zeros(self.surface.n_areas, np.bool_)
         for k, other in enumerate(self._lanes):
-            chosen[k] = own.lane_id in other.successors or other.lane_id in own.successors
+            chosen[k] = (
+                lane_data.lane_id in other.successors or other.lane_id in lane_data.successors
+            )
         chosen[lane] = True
         return self.surface.region(chosen)
 

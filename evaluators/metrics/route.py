@@ -106,13 +106,13 @@ def followed(path: F64, distance_m: F64, s: F64, points: F64, first_m: float) ->
         before = float(out[k - 1]) if k else first_m
         low = max(before - reach_m[k], 0.0)
         high = min(before + reach_m[k], float(lengths[-1]))
-        found = []
+        candidates = []
         for start in (low, min(before, high)):
             inner = path[np.searchsorted(lengths, start, "right") : np.searchsorted(lengths, high)]
             ends = _at(path, lengths, start)[None], _at(path, lengths, high)[None]
             away_m, within_m = to_path(np.concatenate([ends[0], inner, ends[1]]), points[[k]])
-            found.append((float(away_m[0]), start + float(within_m[0])))
-        nearest, ahead = found
+            candidates.append((float(away_m[0]), start + float(within_m[0])))
+        nearest, ahead = candidates
         out[k] = (ahead if ahead[0] <= nearest[0] + SAME_M else nearest)[1]
         if nearest[0] >= LEFT_ROUTE_M and distance_m[k] <= FOUND_M:
             along = _at(path, lengths, s[k] + FOUND_M) - _at(path, lengths, s[k] - FOUND_M)

@@ -82,10 +82,10 @@ def score(
     check_rollout(rollout)
     out: dict[str, MetricSeries] = {}
     specs = resolve_evaluators() if evaluators is None else evaluators
-    known = table_of(specs)
+    metric_table = table_of(specs)
     for spec in specs:
         for metric_series in run_evaluator(
-            spec.name, build(spec, preset=chosen), rollout, scene, known
+            spec.name, build(spec, preset=chosen), rollout, scene, metric_table
         ):
             if metric_series.name in out:
                 raise EvaluatorError(
@@ -97,7 +97,11 @@ def score(
 
 
 def run_evaluator(
-    name: str, evaluator: Evaluator, rollout: RolloutLog, scene: Scene, known: MetricTable = METRICS
+    name: str,
+    evaluator: Evaluator,
+    rollout: RolloutLog,
+    scene: Scene,
+    metric_table: MetricTable = METRICS,
 ) -> list[MetricSeries]:
     """Run one evaluator, check its answer and give every series its metric from a table.
 
@@ -106,13 +110,13 @@ def run_evaluator(
             lengths; it is named.
     """
     called = defined(evaluator, "__call__")
-    what = f"evaluator {name!r}, scene {rollout.scene_id!r}"
+    subject = f"evaluator {name!r}, scene {rollout.scene_id!r}"
     if not is_own(evaluator):  # the next one must see the same
         rollout = shielded(rollout)
         scene = shielded(scene)
-    with blaming(EvaluatorError, what, called, not is_own(evaluator)):
+    with blaming(EvaluatorError, subject, called, not is_own(evaluator)):
         answer = [
-            replace(metric_series, metric=known.info(metric_series.name))
+            replace(metric_series, metric=metric_table.info(metric_series.name))
             for metric_series in evaluator(rollout, scene)
         ]
     for metric_series in answer:

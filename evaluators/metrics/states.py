@@ -77,14 +77,14 @@ class Tracks:
 
     Attributes:
         ids, kinds: ``(A,)``.
-        there: ``(A, T)``.
+        is_present: ``(A, T)``.
         xy: ``(A, T, 2)`` box centres, m; yaw ``(A, T)``; size ``(A, 2)`` length and width.
         velocity: ``(A, T, 2)`` m/s, world axes.
     """
 
     ids: tuple[str, ...]
     kinds: tuple[Kind, ...]
-    there: Bool
+    is_present: Bool
     xy: F64
     yaw: F64
     size: F64
@@ -194,5 +194,5 @@ def savitzky_golay(values: F64, window: int, order: int, times: int = 0) -> F64:
     )
     fit = np.linalg.pinv(np.vander(np.arange(window), order + 1, increasing=True))
     polynomials = polynomial.polyder(fit @ sliding_window_view(values, window).T, times)
-    found = polynomial.polyval(place, polynomials[:, start], tensor=False)
-    return found.astype(np.float64)
+    derivative = polynomial.polyval(place, polynomials[:, start], tensor=False)
+    return derivative.astype(np.float64)

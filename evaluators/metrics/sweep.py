@@ -62,12 +62,12 @@ def gaps(pairs: Motions, tau: F64) -> F64:
     for body in (0, 1):
         cos = np.cos(yaw[:, body])
         sin = np.sin(yaw[:, body])
-        own = pairs.half[:, body]
-        other = pairs.half[:, 1 - body]
+        half_size = pairs.half[:, body]
+        other_half_size = pairs.half[:, 1 - body]
         offsets = (cos * center[:, 0] + sin * center[:, 1], cos * center[:, 1] - sin * center[:, 0])
         reach = (
-            own[:, 0] + other[:, 0] * c + other[:, 1] * s,
-            own[:, 1] + other[:, 0] * s + other[:, 1] * c,
+            half_size[:, 0] + other_half_size[:, 0] * c + other_half_size[:, 1] * s,
+            half_size[:, 1] + other_half_size[:, 0] * s + other_half_size[:, 1] * c,
         )
         for axis in (0, 1):
             k = 4 * body + 2 * axis

@@ -165,12 +165,12 @@ class MetricTable(Mapping[str, MetricInfo]):
         """
         for name in names:
             if name in self and name in other:
-                mine, theirs = (
+                traits, other_traits = (
                     [getattr(table[name], key) for key in AGREE] for table in (self, other)
                 )
-                if mine != theirs:
+                if traits != other_traits:
                     raise InputError(
-                        f"{who}, metric {name!r}: unit, better side and reduction are {mine} and {theirs}",
+                        f"{who}, metric {name!r}: unit, better side and reduction are {traits} and {other_traits}",
                         "choose runs of one version of the metric",
                     )
         return MetricTable({**other._metrics, **self._metrics})

@@ -74,8 +74,8 @@ def still_map(
                 mark |= body(centre, event.yaw_rad, vehicle, place)
             marks.append(mark | {"text": text})
     if happened:
-        at_us, what = min(happened)
-        moment = f"when the first {what} happens"
+        at_us, event_name = min(happened)
+        moment = f"when the first {event_name} happens"
     users = []
     line = shapely.linestrings(recorded)
     for actor in content.get("actors") or ():

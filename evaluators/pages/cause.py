@@ -127,13 +127,13 @@ def worst_failure(run: Run) -> Rollout:
     Raises:
         InputError: No rollout failed.
     """
-    failed = [one for one in run.rollouts if not one.ok or outcomes_of(one)]
+    failed = [rollout for rollout in run.rollouts if not rollout.ok or outcomes_of(rollout)]
     if not failed:
         raise InputError(
             f"{run.folder}: no rollout of this run failed",
             "Name a rollout: simrun why RUN/RENDERER/POLICY/SCENE/SEED.",
         )
-    return min(failed, key=lambda one: gravity(one) if one.ok else -1)
+    return min(failed, key=lambda rollout: gravity(rollout) if rollout.ok else -1)
 
 
 def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
@@ -165,8 +165,8 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     sentences = [f"{CHECK}{text}." for _, text in check.breaches]
     if not rollout.ok:
         outcome = f"{rollout.failure_class}: {rollout.failure}"
-        said = last_output(run.folder / rollout.path / OUTPUT_NAME)
-        sentences = [*(sentences or [rollout.failure]), *said]
+        last_lines = last_output(run.folder / rollout.path / OUTPUT_NAME)
+        sentences = [*(sentences or [rollout.failure]), *last_lines]
     sentences += behind_others(run, rollout)
     for name, text in sorted(check.notes, key=lambda note: note[0] != "lag"):
         if outcomes & {*TELLING.get(name, ())}:
@@ -178,9 +178,9 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
         if ended_us is not None:
             sentences += plan_facts(log, ended_us, outcomes, met)
     sentences += [
-        f"Plans part from those of the {one.kind} {one.name} at {one.at_s:.1f} s, "
-        f"by {one.gap_m:.2f} m."
-        for one in partings
+        f"Plans part from those of the {parting.kind} {parting.name} at {parting.at_s:.1f} s, "
+        f"by {parting.gap_m:.2f} m."
+        for parting in partings
     ]
     made_up = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
     sentences += [f"{made_up}."] if made_up else []
@@ -281,8 +281,8 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
     scale = min(1.0, WIDTH_PX / cameras[0].width) if cameras else 1.0
     taken = [[one for one in log.images if one.camera == camera.name] for camera in cameras]
     driven = speeds(log.ego)
-    said = run.file_of(rollout, DEBUG_NAME)
-    debug = {} if said is None else {row["t_us"]: row for row in read_facts(said)}
+    debug_file = run.file_of(rollout, DEBUG_NAME)
+    debug = {} if debug_file is None else {row["t_us"]: row for row in read_facts(debug_file)}
     others = same_poses(run, rollout)
 
     def jpeg_of(data: bytes, camera: CameraSpec) -> str:
@@ -293,22 +293,27 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
     queries = []
     for plan in shown_plans(log, cause.failed_us):
         pose = interpolate(log.ego, [plan.now_us])[0] @ inverse(log.T_rig_box)
-        own: JsonObject = dict(debug.get(plan.now_us) or debug_row({}))
-        own["lines"] = [[name, _in_world(pose, xy, place)] for name, xy in own["lines"]]
-        own["boxes"] = [
+        debug_facts: JsonObject = dict(debug.get(plan.now_us) or debug_row({}))
+        debug_facts["lines"] = [
+            [name, _in_world(pose, xy, place)] for name, xy in debug_facts["lines"]
+        ]
+        debug_facts["boxes"] = [
             [name, *(round(scale * side, 1) for side in box)]
-            for name, boxes in own["boxes"]
+            for name, boxes in debug_facts["boxes"]
             for box in boxes
         ]
         newest = [_newest(images, plan.now_us) for images in taken]
-        seen: dict[str, JsonObject] = {}
+        views: dict[str, JsonObject] = {}
         if newest and newest[0] is not None:
             t_us = newest[0].end_us
-            shown = {rollout.renderer: newest[0].data}
-            shown |= {name: at[t_us] for name, at in others.items() if t_us in at}
+            images_by_renderer = {rollout.renderer: newest[0].data}
+            images_by_renderer |= {
+                name: frames[t_us] for name, frames in others.items() if t_us in frames
+            }
             t_ms = place.ms([t_us])[0]
-            seen = {
-                name: {"jpeg": jpeg_of(data, cameras[0]), "t": t_ms} for name, data in shown.items()
+            views = {
+                name: {"jpeg": jpeg_of(data, cameras[0]), "t": t_ms}
+                for name, data in images_by_renderer.items()
             }
         beside = [
             [camera.name, jpeg_of(image.data, camera)]
@@ -321,9 +326,9 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
                 "speed": round(float(np.interp(plan.now_us, log.ego.t_us, driven)), 2),
                 "route": _in_world(pose, plan.route, place),
                 "plan": plan_lines(plan, place),
-                "seen": seen,
+                "seen": views,
                 "beside": beside,
-                "said": own,
+                "said": debug_facts,
             }
         )
     return queries
@@ -337,9 +342,9 @@ def _newest(images: Sequence[LoggedImage], t_us: int) -> LoggedImage | None:
 
 def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:
     """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
-    known = np.asarray(xy, np.float64).reshape(-1, 2)
-    known = known[np.isfinite(known).all(axis=1)]
-    rig = np.column_stack([known, np.zeros(len(known))])
+    points = np.asarray(xy, np.float64).reshape(-1, 2)
+    points = points[np.isfinite(points).all(axis=1)]
+    rig = np.column_stack([points, np.zeros(len(points))])
     return place.cm(transform_points(T_world_rig, rig)[:, :2])
 
 

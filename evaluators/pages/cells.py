@@ -135,13 +135,13 @@ class Wanted:
     @property
     def axes(self) -> dict[str, tuple[object, ...]]:
         """Give what was asked for of each axis of a run."""
-        asked = {
+        names_by_axis = {
             "scene": self.scenes,
             "policy": self.policies,
             "seed": self.seeds,
             "renderer": self.renderers,
         }
-        return {axis: names for axis, names in asked.items() if names}
+        return {axis: names for axis, names in names_by_axis.items() if names}
 
     def takes(self, rollout: Rollout) -> bool:
         """Tell whether a rollout was asked for."""
@@ -162,12 +162,12 @@ def check_wanted(run: Run, wanted: Wanted) -> None:
         InputError: Something of that kind was asked for.
     """
     for axis, names in wanted.axes.items():
-        known = list(dict.fromkeys(getattr(rollout, axis) for rollout in run.rollouts))
+        names_of_run = list(dict.fromkeys(getattr(rollout, axis) for rollout in run.rollouts))
         for name in names:
-            if not any(_is_called(value, name) for value in known):
-                some = ", ".join(map(str, known[:8]))
+            if not any(_is_called(value, name) for value in names_of_run):
+                examples = ", ".join(map(str, names_of_run[:8]))
                 raise InputError(
-                    f"--{axis} {name}: the run has none; it has {some}", "Name one of these."
+                    f"--{axis} {name}: the run has none; it has {examples}", "Name one of these."
                 )
 
 
@@ -185,7 +185,8 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
     sides = run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     takes: Counter[tuple[str, str, str, int]] = Counter()
-    for rollout in sorted(run.rollouts, key=lambda one: sides.index(getattr(one, side))):
+    in_order = sorted(run.rollouts, key=lambda rollout: sides.index(getattr(rollout, side)))
+    for rollout in in_order:
         if wanted.takes(rollout):
             take = takes[rollout.cell]
             takes[rollout.cell] += 1
@@ -340,7 +341,7 @@ def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
 def index_data(
     run: Run,
     cells: Sequence[WatchedCell],
-    here: Sequence[WatchedCell],
+    page_cells: Sequence[WatchedCell],
     notes: Sequence[str],
     report: str,
 ) -> JsonObject:
@@ -349,11 +350,11 @@ def index_data(
     Args:
         run: The run.
         cells: All cells that were asked for, the most telling first.
-        here: Those whose documents the page has.
+        page_cells: Those whose documents the page has.
         notes: What was left out, one sentence each.
         report: Address of the run's report, or "".
     """
-    ids = {cell.id for cell in here}
+    ids = {cell.id for cell in page_cells}
     tables = run.summary.metrics.values()
     metrics = {}
     for name in run.table.ordered({*run.table, *(name for table in tables for name in table)}):

@@ -104,10 +104,10 @@ def write_summary_md(run: Run) -> Path:
 
 def _first_screen(run: Run) -> dict[str, Any]:
     """Return what the first screen's template prints."""
-    shown = overview_of(run)
-    forest = "\n".join(line.plain.rstrip() for line in forest_lines(shown, PLOT_LETTERS))
-    body = [shown.cells(row) for row in shown.rows]
-    return {"shown": shown, "body": body, "forest": Markup(forest.replace("`", ""))}
+    overview = overview_of(run)
+    forest = "\n".join(line.plain.rstrip() for line in forest_lines(overview, PLOT_LETTERS))
+    body = [overview.cells(row) for row in overview.rows]
+    return {"overview": overview, "body": body, "forest": Markup(forest.replace("`", ""))}
 
 
 def cut(text: str, limit: int = MAX_BYTES) -> str:

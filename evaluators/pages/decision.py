@@ -42,18 +42,18 @@ def guarantee(decision: Decision) -> list[str]:
     ]
 
 
-def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[JsonObject]:
+def metric_rows(decision: Decision, table: MetricTable = METRICS) -> list[JsonObject]:
     """Return the printed numbers of each metric at the last interim analysis."""
     if not decision["looks"]:
         return []
     last = decision["looks"][-1]["metrics"]
     rows = []
-    for name, asked in decision["question"]["metrics"].items():
+    for name, criterion in decision["question"]["metrics"].items():
         state = last[name]
-        facts = known.info(name)
+        facts = table.info(name)
         scale, unit = _scale(facts)
         ends = [value for value in (state["diff"], *state["interval"]) if value is not None]
-        texts = iter(printed(facts, asked["margin"], *ends, sign=True)[1:])
+        texts = iter(printed(facts, criterion["margin"], *ends, sign=True)[1:])
         diff, low, high = (
             None if value is None else next(texts) for value in (state["diff"], *state["interval"])
         )
@@ -65,10 +65,10 @@ def metric_rows(decision: Decision, known: MetricTable = METRICS) -> list[JsonOb
                 "tone": tone_of_cause(CAUSES[state["verdict"]]),
                 "diff": "no pair" if diff is None else diff + unit,
                 "interval": interval if low or high else "no bound yet",
-                "margin": f"{scale * asked['margin']:g}",
+                "margin": f"{scale * criterion['margin']:g}",
                 "evidence": f"{state['e_good']:.3g} and {state['e_bad']:.3g}",
                 "n_scenes": state["n_scenes"],
-                "binding": asked["binding"],
+                "binding": criterion["binding"],
             }
         )
     return rows
@@ -128,11 +128,11 @@ def chart(decision: Decision, metric: MetricInfo) -> Chart:
     for limit in limits:
         axes.axhline(limit, color=INK, linewidth=1.0, linestyle="dashed")
     late = len(looks) // 2  # the bounds of the first analyses would make the rest flat
-    known = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
-    known = known[np.isfinite(known)]
-    room = 0.15 * max(float(np.ptp(known)), 1e-9)
+    extent = np.concatenate([diff, limits, [0.0], low[late:], high[late:]])
+    extent = extent[np.isfinite(extent)]
+    room = 0.15 * max(float(np.ptp(extent)), 1e-9)
     axes.set_xlim(0.0, float(scenes[-1]) * 1.02)
-    axes.set_ylim(float(known.min()) - room, float(known.max()) + room)
+    axes.set_ylim(float(extent.min()) - room, float(extent.max()) + room)
     note = (
         "Line: mean difference. Band: what is not refuted, at every analysis. Dashed: the margin."
     )

@@ -231,9 +231,11 @@ def moments(
     """List what happened when: counted collisions and departures from the road, and frames that a
     guard replaced or named.
     """
-    known = steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
-    found = []
-    for event in events_of(rollout, series_by_cell(known)):
+    event_steps = (
+        steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
+    )
+    event_rows = []
+    for event in events_of(rollout, series_by_cell(event_steps)):
         text = event.what
         t_ms = None
         if event.t_us is not None and event.t_s is not None:
@@ -244,7 +246,7 @@ def moments(
                         text += f" with {contact.actor_id}"
                         break
             text = "; ".join(filter(None, (text, seen_before(frames, event.t_us))))
-        found.append({"t": t_ms, "kind": event.kind, "text": text})
+        event_rows.append({"t": t_ms, "kind": event.kind, "text": text})
     # Consecutive frames with the same event, such as replaced frames, make one event at the first.
     began = []
     before: set[str] = set()
@@ -257,7 +259,7 @@ def moments(
                 {"t": began_ms, "kind": "frame", "text": f"frame: {name}"} for name in started
             ]
         before = now
-    return found + began[:MAX_FRAME_EVENTS]
+    return event_rows + began[:MAX_FRAME_EVENTS]
 
 
 def plans_part(flips: Sequence[JsonView], place: Place, by_policy: bool) -> list[JsonObject]:

@@ -42,35 +42,35 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
         driven = speeds(log.ego)
         for plan in plans:
             speed = float(np.interp(plan.now_us, log.ego.t_us, driven))
-            asked = asked_mps(plan)
-            if asked < BRAKES * speed:
+            planned_mps = asked_mps(plan)
+            if planned_mps < BRAKES * speed:
                 before_s = (failed_us - plan.now_us) * 1e-6
-                found = f"The first plan that brakes comes {before_s:.1f} s before the contact"
-                return [*facts, f"{found}, at {speed:.1f} m/s."]
+                sentence = f"The first plan that brakes comes {before_s:.1f} s before the contact"
+                return [*facts, f"{sentence}, at {speed:.1f} m/s."]
         return [
             *facts,
-            f"No plan brakes: the last one asks for {asked:.1f} m/s, at {speed:.1f} m/s.",
+            f"No plan brakes: the last one asks for {planned_mps:.1f} m/s, at {speed:.1f} m/s.",
         ]
     if not outcomes or outcomes & {"stalled", "braked_without_cause"}:
         reaches = [float(np.hypot(*_ahead(plan, 2_000_000))) < STANDS_M for plan in plans]
         event = "failure" if outcomes else "end"
-        said = f"before the {event} stands: less than {STANDS_M} m in two seconds"
+        property_text = f"before the {event} stands: less than {STANDS_M} m in two seconds"
     else:
         reaches = [_beside_m(plan) > AWAY_M for plan in plans]
         most_m = max(_beside_m(plan) for plan in plans)
-        said = f"before the failure leads away from the route: up to {most_m:.1f} m beside it in two seconds"
-    return _since(plans, reaches, failed_us, said)
+        property_text = f"before the failure leads away from the route: up to {most_m:.1f} m beside it in two seconds"
+    return _since(plans, reaches, failed_us, property_text)
 
 
 def _since(
-    plans: Sequence[LoggedPlan], flags: Sequence[bool], failed_us: int, said: str
+    plans: Sequence[LoggedPlan], flags: Sequence[bool], failed_us: int, property_text: str
 ) -> list[str]:
     """Say since when all plans have had a property; nothing where the last one does not."""
     first = len(flags) - [*flags[::-1], False].index(False)
     if first == len(plans):
         return []
     before_s = (failed_us - plans[first].now_us) * 1e-6
-    return [f"Every plan of the last {before_s:.1f} s {said}."]
+    return [f"Every plan of the last {before_s:.1f} s {property_text}."]
 
 
 def _leads_into(log: RolloutLog, plan: Trajectory, actor: Actor) -> bool:

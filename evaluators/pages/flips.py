@@ -60,12 +60,14 @@ class Flip:
     @property
     def sides(self) -> tuple[str, str]:
         """Give what the two sides are called: by their renderers, their policies, or both."""
-        one = self.base
-        two = self.other
-        if one.policy == two.policy:
-            return one.renderer, two.renderer
+        base = self.base
+        other = self.other
+        if base.policy == other.policy:
+            return base.renderer, other.renderer
         return (
-            (one.policy, two.policy) if one.renderer == two.renderer else (one.variant, two.variant)
+            (base.policy, other.policy)
+            if base.renderer == other.renderer
+            else (base.variant, other.variant)
         )
 
 
@@ -78,17 +80,17 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
         compared.
     """
     bases = flip_bases(run)
-    known: dict[tuple[str, str, str, int], Rollout] = {}
+    by_cell: dict[tuple[str, str, str, int], Rollout] = {}
     for rollout in run.rollouts:
         if has_ended(rollout):
-            known.setdefault(rollout.cell, rollout)
+            by_cell.setdefault(rollout.cell, rollout)
     flips = []
     compared = 0
     for rollout in run.rollouts:
         for base in bases if has_ended(rollout) else ():
             variant = Variant(rollout.renderer, rollout.policy)
             other = base.of(variant)
-            partner = known.get((other.renderer, other.policy, rollout.scene, rollout.seed))
+            partner = by_cell.get((other.renderer, other.policy, rollout.scene, rollout.seed))
             if other == variant or partner is None or not (rollout.ok or partner.ok):
                 continue
             compared += 1
@@ -109,8 +111,8 @@ def flip_bases(run: Run) -> list[Base]:
     _, by_policy = axis_bases(
         [Variant(r, policy) for r in run.renderers for policy in run.policies], named
     )
-    found = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
-    return [*found, *([by_policy] if by_policy else [])]
+    bases = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
+    return [*bases, *([by_policy] if by_policy else [])]
 
 
 def baseline_of(run: Run) -> str | None:
@@ -154,15 +156,15 @@ def flip_rows(run: Run, budget_bytes: int) -> tuple[list[FlipRow], int, int]:
         The rows, how many more flips there are, and the number of pairs compared.
     """
     flips, compared = find_flips(run)
-    known = {key_of_entry(entry): entry for entry in flip_entries(run)}
+    entries = {key_of_entry(entry): entry for entry in flip_entries(run)}
     unknown = "the run folder has no logs to look for it in"
-    if known:
+    if entries:
         unknown = "not looked for: there are too many flips"
     colours = colours_of(run)
     spent = 0
     rows = []
     for flip in flips[:MAX_FLIP_ROWS]:
-        entry: JsonView = known.get(flip.key) or {"t_us": None, "reason": unknown}
+        entry: JsonView = entries.get(flip.key) or {"t_us": None, "reason": unknown}
         why_not = entry.get("reason") or entry.get("frames_reason") or TOO_MANY
         images = []
         links = []

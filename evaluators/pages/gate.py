@@ -50,9 +50,9 @@ def worst_of(checks: Sequence[JsonView]) -> list[JsonObject]:
     pairs: dict[tuple[Any, ...], JsonObject] = {}
     for check in sorted(checks, key=lambda check: check["cause"] != "regression"):
         if check["cause"] != "pass":
-            of = {name: check[name] for name in ("metric", "renderer", "policy")}
+            variant = {name: check[name] for name in ("metric", "renderer", "policy")}
             for pair in check["entry"]["worst"][:WORST]:
-                pairs.setdefault((*of.values(), pair["scene"], pair["seed"]), of | pair)
+                pairs.setdefault((*variant.values(), pair["scene"], pair["seed"]), variant | pair)
     return list(pairs.values())
 
 
@@ -87,8 +87,8 @@ def gate_section(run: Run) -> JsonObject | None:
     for pair in worst_of(stored["checks"]):
         unit = run.table.shown(pair["metric"]).unit
         cell = (pair["renderer"], pair["policy"], pair["scene"], pair["seed"])
-        shown = {name: short(pair[name], unit) for name in ("was", "now")}
-        worst.append(pair | shown | {"page": pages.get(cell)})
+        texts = {name: short(pair[name], unit) for name in ("was", "now")}
+        worst.append(pair | texts | {"page": pages.get(cell)})
     outcome = stored["outcome"]
     return {
         "title": WORDS[outcome["cause"]],

@@ -152,9 +152,9 @@ def context(run: Run) -> dict[str, Any]:
         "variant_colour": colours,
         "flips": flips,
         "whys": {
-            one.path: page
-            for one in run.rollouts
-            if one.ok and outcomes_of(one) and (page := run.href(one, WHY_NAME))
+            rollout.path: page
+            for rollout in run.rollouts
+            if rollout.ok and outcomes_of(rollout) and (page := run.href(rollout, WHY_NAME))
         },
         "more_flips": more_flips,
         "n_flips": len(flips) + more_flips,
@@ -224,16 +224,16 @@ def scene_views(
         The maps (in the order of the run where all are shown at once, else the most telling
         first), and the scenes not drawn.
     """
-    drawn: dict[str, JsonObject] = {}
+    views: dict[str, JsonObject] = {}
     spent = 0
     for scene in interesting:
         content = run.scene_data(scene)
         if content is None or len(content["ego_log"]["x_m"]) < 2:
             continue
-        if len(drawn) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
+        if len(views) >= MAX_SCENE_PLOTS or spent > PLOT_BUDGET_BYTES:
             break
         with parsing(run.scene_path(scene) or scene, AGAIN, "no scene that can be drawn"):
-            drawn[scene] = still_map(scene, content, run.by_scene[scene], series, variant_of)
-        spent += len(json.dumps(drawn[scene]))
-    order = run.scenes if len(drawn) <= OPEN_SCENE_PLOTS else interesting
-    return [drawn[s] for s in order if s in drawn], [s for s in run.scenes if s not in drawn]
+            views[scene] = still_map(scene, content, run.by_scene[scene], series, variant_of)
+        spent += len(json.dumps(views[scene]))
+    order = run.scenes if len(views) <= OPEN_SCENE_PLOTS else interesting
+    return [views[s] for s in order if s in views], [s for s in run.scenes if s not in views]

@@ -184,9 +184,9 @@ class Overview:
         """List the columns of endings with what each counts: those that every table has, and one
         for all others that occur.
         """
-        known = dict.fromkeys(name for row in self.rows for name in row.endings)
+        ending_names = dict.fromkeys(name for row in self.rows for name in row.endings)
         columns: list[tuple[str, tuple[str, ...]]] = [(name, (name,)) for name in COLUMNS]
-        others = tuple(name for name in known if name not in COLUMNS)
+        others = tuple(name for name in ending_names if name not in COLUMNS)
         if others:
             columns.append((others[0] if len(others) == 1 else "other", others))
         return columns
@@ -216,10 +216,10 @@ class Overview:
     @property
     def axis(self) -> str:
         """Say what the differences are and which side is worse; empty without any."""
-        found = [row.difference for row in self.rows if row.difference is not None]
-        if not found:
+        differences = [row.difference for row in self.rows if row.difference is not None]
+        if not differences:
             return ""
-        margin = f", band: margin of {found[0].margin:g}" if found[0].margin else ""
+        margin = f", band: margin of {differences[0].margin:g}" if differences[0].margin else ""
         side = "left" if self.higher_is_better else "right"
         return (
             f"{self.question} minus {self.baselines}, {self.unit}, 95 % ({side} is worse{margin})"
@@ -234,10 +234,15 @@ class Overview:
     @property
     def limits(self) -> tuple[float, float]:
         """Give the ends of the axis of the differences."""
-        found = [row.difference for row in self.rows if row.difference is not None]
+        differences = [row.difference for row in self.rows if row.difference is not None]
         ends = [0.0]
-        for one in found:
-            ends += [one.centre, one.margin, -one.margin, *(one.bounds or ())]
+        for difference in differences:
+            ends += [
+                difference.centre,
+                difference.margin,
+                -difference.margin,
+                *(difference.bounds or ()),
+            ]
         room = 0.04 * (max(ends) - min(ends)) or 1.0
         return min(ends) - room, max(ends) + room
 
@@ -330,14 +335,14 @@ def differences_of(run: Run) -> dict[str, PrimaryDifference]:
     if not summary.paired:
         blocks.append(summary.paired_policies)
     metric = run.table.shown(run.table.primary)
-    found: dict[str, PrimaryDifference] = {}
+    differences: dict[str, PrimaryDifference] = {}
     for block in blocks:
         for key, pairs in block.items():
             entry = pairs.get(metric.name)
-            if key not in found and entry is not None and entry.diff is not None:
+            if key not in differences and entry is not None and entry.diff is not None:
                 baseline = variant_name(run, entry.baseline)
-                found[key] = _primary_difference(metric, entry, entry.diff, baseline)
-    return found
+                differences[key] = _primary_difference(metric, entry, entry.diff, baseline)
+    return differences
 
 
 def _primary_difference(
@@ -367,24 +372,24 @@ def decided(rows: Sequence[VariantRow]) -> str:
     """Say once what is decided about the differences, and about how many scenes would decide the
     rest; empty without any.
     """
-    found = {row.name: row.difference for row in rows if row.difference is not None}
-    said: dict[str, list[str]] = {}
+    differences = {row.name: row.difference for row in rows if row.difference is not None}
+    names_by_verdict: dict[str, list[str]] = {}
     for tone in VERDICTS:
-        for name, one in found.items():
-            if one.tone == tone:
-                said.setdefault(one.verdict, []).append(name)
-    parts = [f"{', '.join(names)} {verdict}" for verdict, names in said.items()]
-    still_open = {name: one for name, one in found.items() if one.tone == "unclear"}
+        for name, difference in differences.items():
+            if difference.tone == tone:
+                names_by_verdict.setdefault(difference.verdict, []).append(name)
+    parts = [f"{', '.join(names)} {verdict}" for verdict, names in names_by_verdict.items()]
+    still_open = {
+        name: difference for name, difference in differences.items() if difference.tone == "unclear"
+    }
     if still_open:
-        text = (
-            f"Not decided with {plural(min(one.n_scenes for one in still_open.values()), 'scene')}"
-        )
+        text = f"Not decided with {plural(min(difference.n_scenes for difference in still_open.values()), 'scene')}"
         if parts:
             text += f": {', '.join(still_open)}"
         needed = [
-            one.n_scenes + one.more_scenes
-            for one in still_open.values()
-            if one.more_scenes is not None
+            difference.n_scenes + difference.more_scenes
+            for difference in still_open.values()
+            if difference.more_scenes is not None
         ]
         if needed:
             most = max(needed)

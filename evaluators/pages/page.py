@@ -60,15 +60,15 @@ class Page:
     Attributes:
         path: The file.
         size: Bytes.
-        shown: Cells that it replays.
-        known: All cells that were asked for.
+        cells: Cells that it replays.
+        all_cells: All cells that were asked for.
         notes: What it leaves out, a sentence each.
     """
 
     path: Path
     size: int
-    shown: Sequence[WatchedCell]
-    known: Sequence[WatchedCell]
+    cells: Sequence[WatchedCell]
+    all_cells: Sequence[WatchedCell]
     notes: Sequence[str]
 
 
@@ -97,13 +97,13 @@ def write_page(run: Run, path: Path, wanted: Wanted, max_bytes: int = MAX_BYTES)
         )
     is_beside = real(path).parent == real(run.folder) and os.path.isfile(run.folder / REPORT)
     report = REPORT if is_beside else ""
-    asked = shown_by_default(cells, wanted)
+    default_cells = shown_by_default(cells, wanted)
     with reporting(run):
         shell = len(_render(index_data(run, cells, (), [], report), {}))
         room = max_bytes - shell - NOTES_BYTES
         used = np.zeros(len(STRIDES))  # bytes of the documents, by how much they are thinned
         documents: dict[str, JsonObject] = {}
-        for cell in asked:
+        for cell in default_cells:
             document = cell_data(run, cell, read_logs(run, cell))
             sizes = [len(as_json(thinned(document, stride))) for stride in STRIDES]
             if documents and used[-1] + sizes[-1] > room:
@@ -113,12 +113,12 @@ def write_page(run: Run, path: Path, wanted: Wanted, max_bytes: int = MAX_BYTES)
         stride = next(
             (n for n, size in zip(STRIDES, used, strict=True) if size <= room), STRIDES[-1]
         )
-        shown = asked[: len(documents)]
-        notes = _notes(cells, asked, asked[len(shown) :], stride)
+        page_cells = default_cells[: len(documents)]
+        notes = _notes(cells, default_cells, default_cells[len(page_cells) :], stride)
         texts = {name: as_json(thinned(one, stride)) for name, one in documents.items()}
-        html = _render(index_data(run, cells, shown, notes, report), texts)
+        html = _render(index_data(run, cells, page_cells, notes, report), texts)
     write_text(path, html)
-    return Page(path, path.stat().st_size, shown, cells, notes)
+    return Page(path, path.stat().st_size, page_cells, cells, notes)
 
 
 def thinned(document: JsonView, factor: int) -> JsonObject:
@@ -164,12 +164,12 @@ def fill(template: str, scripts: Sequence[str], styles: Sequence[str], **values:
 
 def _notes(
     cells: Sequence[WatchedCell],
-    asked: Sequence[WatchedCell],
+    default_cells: Sequence[WatchedCell],
     too_many: Sequence[WatchedCell],
     stride: int,
 ) -> list[str]:
     """Say what the page does not hold, one sentence each."""
-    ids = {cell.id for cell in asked}
+    ids = {cell.id for cell in default_cells}
     left = [cell for cell in cells if cell.id not in ids and cell.watchable]
     failed = [cell for cell in cells if not cell.watchable]
     reasons = {

@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from alpasim_plugin.log.run_folder.rows import Own, Rollout, Series
+from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, Series
 from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
 from evaluators.metrics.outcomes import (
     OUTCOMES,
@@ -99,40 +99,47 @@ def events_of(rollout: Rollout, series: Series) -> list[Event]:
     Steps that do not count (``eval_relevant`` 0, during warm-up) are passed over, so that the time
     shown is that of the event counted.
     """
-    own = series.get(rollout.cell, {})
-    found = []
+    cell_series = series.get(rollout.cell, {})
+    collisions = []
     if rollout.flag(*COLLISION):
-        found.append(_event("collision", rollout, own, [m for m in COLLISION if rollout.flag(m)]))
-    shown = {one.name for one in told(outcomes_of(rollout))}
-    return [*found, *(_event(name, rollout, own, [name]) for name in OTHERS if name in shown)]
+        collisions.append(
+            _event("collision", rollout, cell_series, [m for m in COLLISION if rollout.flag(m)])
+        )
+    outcome_names = {one.name for one in told(outcomes_of(rollout))}
+    return [
+        *collisions,
+        *(_event(name, rollout, cell_series, [name]) for name in OTHERS if name in outcome_names),
+    ]
 
 
-def _event(kind: str, rollout: Rollout, own: Own, metrics: list[str]) -> Event:
-    firsts = {m: t for m in metrics if (t := _first(own, m)) is not None}
+def _event(kind: str, rollout: Rollout, cell_series: CellSeries, metrics: list[str]) -> Event:
+    firsts = {m: t for m in metrics if (t := _first(cell_series, m)) is not None}
     side = next((SIDES[m] for m in metrics if m in SIDES), "")
     if not firsts:
         return Event(kind, rollout, side=side)
     t_us = min(firsts.values())
-    zero_us = min(int(t[0]) for t, _ in own.values())
-    x_m, y_m, yaw_rad = (_at(own, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad"))
+    zero_us = min(int(t[0]) for t, _ in cell_series.values())
+    x_m, y_m, yaw_rad = (
+        _at(cell_series, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad")
+    )
     return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side, t_us)
 
 
-def _first(own: Own, metric: str) -> int | None:
-    if metric not in own:
+def _first(cell_series: CellSeries, metric: str) -> int | None:
+    if metric not in cell_series:
         return None
-    t_us, value = own[metric]
+    t_us, value = cell_series[metric]
     hit = value >= 0.5
-    if "eval_relevant" in own:
-        relevant_t, relevant = own["eval_relevant"]
+    if "eval_relevant" in cell_series:
+        relevant_t, relevant = cell_series["eval_relevant"]
         hit &= np.isin(t_us, relevant_t[relevant >= 0.5])
     return int(t_us[int(np.argmax(hit))]) if hit.any() else None
 
 
-def _at(own: Own, name: str, t_us: int) -> float | None:
-    if name not in own or not own[name][0].size:
+def _at(cell_series: CellSeries, name: str, t_us: int) -> float | None:
+    if name not in cell_series or not cell_series[name][0].size:
         return None
-    times, values = own[name]
+    times, values = cell_series[name]
     return float(values[int(np.argmin(np.abs(times - t_us)))])
 
 
@@ -147,12 +154,12 @@ class RolloutBlock:
 
     Attributes:
         data: Base64 of the compressed document.
-        shown: Rollouts in it.
+        n_rows: Rollouts in it.
         left_out: Rollouts that are not.
     """
 
     data: str
-    shown: int
+    n_rows: int
     left_out: int
 
 

@@ -156,7 +156,7 @@ def find_runs(roots: Sequence[Path]) -> list[RunEntry]:
     Raises:
         InputError: A root is not a folder.
     """
-    seen: set[str] = set()
+    visited_folders: set[str] = set()
     entries = []
     for root in roots:
         if not os.path.isdir(root):
@@ -166,12 +166,12 @@ def find_runs(roots: Sequence[Path]) -> list[RunEntry]:
             )
         for folder, names, files in os.walk(root, followlinks=True):
             place = os.path.realpath(folder)
-            if place in seen:
+            if place in visited_folders:
                 names.clear()
             elif MARKS & {*files}:
                 names.clear()
                 entries.append(read_entry(Path(folder)))
-            seen.add(place)
+            visited_folders.add(place)
             names[:] = [name for name in names if name[0] != "." and name not in SKIPPED]
     entries.sort(key=lambda entry: str(entry.folder))
     return sorted(entries, key=lambda entry: entry.started_at, reverse=True)

@@ -64,19 +64,19 @@ class PairRow:
 def metric_rows(
     summary: Summary,
     reasons: Mapping[tuple[str, str], str] | None = None,
-    known: MetricTable = METRICS,
+    table: MetricTable = METRICS,
 ) -> list[MetricRow]:
     """Lay out metrics x variants.
 
     Args:
         summary: The results of a run.
         reasons: (renderer, metric) -> why it is invalid, for cells without a number.
-        known: What the metrics are.
+        table: What the metrics are.
     """
     variants = summary.metrics
     rows = []
-    for name in known.ordered(metric for metrics in variants.values() for metric in metrics):
-        facts = known.shown(name)
+    for name in table.ordered(metric for metrics in variants.values() for metric in metrics):
+        facts = table.shown(name)
         entries = {variant: metrics.get(name) for variant, metrics in variants.items()}
         means = [entry for entry in entries.values() if entry is not None]
         direction = means[0].direction
@@ -141,19 +141,19 @@ def metric_cell(metric: MetricInfo, entry: Mean | None, places: int, reason: str
 
 
 def pair_rows(
-    differences: Sequence[tuple[str, Mapping[str, Difference]]], known: MetricTable = METRICS
+    differences: Sequence[tuple[str, Mapping[str, Difference]]], table: MetricTable = METRICS
 ) -> list[PairRow]:
     """Lay out paired differences, headline metrics first within each variant.
 
     Args:
         differences: Variants with METRIC -> difference, in the order of the table
             (`evaluators.results.Summary.differences`).
-        known: What the metrics are.
+        table: What the metrics are.
     """
     return [
-        _pair_row(variant, known.shown(name), pairs[name])
+        _pair_row(variant, table.shown(name), pairs[name])
         for variant, pairs in differences
-        for name in known.ordered(pairs)
+        for name in table.ordered(pairs)
     ]
 
 

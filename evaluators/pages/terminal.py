@@ -79,14 +79,14 @@ def _score_cell(summary: Summary, variant: str, name: str, in_percent: bool) -> 
     return Text(f"{number} ").append(escape(note), style="dim")
 
 
-def metric_lines(summary: Summary, known: MetricTable = METRICS) -> list[str]:
+def metric_lines(summary: Summary, table: MetricTable = METRICS) -> list[str]:
     """Print the mean and 95 % interval of each metric, a line a variant.
 
     Args:
         summary: The results of a run.
-        known: What the metrics are.
+        table: What the metrics are.
     """
-    rows = metric_rows(summary, known=known)
+    rows = metric_rows(summary, table=table)
     names = [escape(name) for name in summary.metrics]
     width = max(map(len, names), default=0)
     lines = []
@@ -107,27 +107,27 @@ def metric_lines(summary: Summary, known: MetricTable = METRICS) -> list[str]:
     return [line.rstrip() for line in lines if line]
 
 
-def overview_lines(shown: Overview, width: int) -> list[Text]:
+def overview_lines(overview: Overview, width: int) -> list[Text]:
     """Print the first screen of a run within a width: table, failures, differences, decision.
 
     A name that is too long for its column stands on a line of its own.
     """
     width = max(width, LEAST_PLOT)  # a terminal may say that it has no columns
-    badge, tone = shown.badge
+    badge, tone = overview.badge
     lines = [Text(badge, f"{STYLES[tone]} bold")]
-    lines += [*(Text(line, "dim") for line in _wrapped(shown.context, width)), Text()]
-    lines += _grid(shown, width)
-    lines += [Text(line, "dim") for line in _wrapped("; ".join(shown.notes), width)]
-    for row in shown.failing[:MOST_NAMED]:
+    lines += [*(Text(line, "dim") for line in _wrapped(overview.context, width)), Text()]
+    lines += _grid(overview, width)
+    lines += [Text(line, "dim") for line in _wrapped("; ".join(overview.notes), width)]
+    for row in overview.failing[:MOST_NAMED]:
         lines += [Text(line) for line in _wrapped(f"{row.name}: {row.where}", width)]
-    if len(shown.failing) > MOST_NAMED:
-        lines.append(Text(f"and {len(shown.failing) - MOST_NAMED} more variants: report.html"))
-    if shown.axis:
-        lines += [Text(), *(Text(line, "dim") for line in _wrapped(shown.axis, width))]
-        lines += forest_lines(shown, width)
-    if shown.decision:
-        lines += [Text(line, "bold") for line in _wrapped(shown.decision, width)]
-    for caution in shown.cautions:
+    if len(overview.failing) > MOST_NAMED:
+        lines.append(Text(f"and {len(overview.failing) - MOST_NAMED} more variants: report.html"))
+    if overview.axis:
+        lines += [Text(), *(Text(line, "dim") for line in _wrapped(overview.axis, width))]
+        lines += forest_lines(overview, width)
+    if overview.decision:
+        lines += [Text(line, "bold") for line in _wrapped(overview.decision, width)]
+    for caution in overview.cautions:
         lines += [Text(line, "yellow") for line in _wrapped(f"caution: {caution}", width)]
     for line in lines:
         line.no_wrap = True
@@ -143,9 +143,9 @@ def _wrapped(text: str, width: int) -> list[str]:
     )
 
 
-def _grid(shown: Overview, width: int) -> list[Text]:
-    heads = [wrap(head, HEAD_WIDTH, break_long_words=False) for head in shown.heads]
-    body = [[escape(cell) for cell in shown.cells(row)] for row in shown.rows]
+def _grid(overview: Overview, width: int) -> list[Text]:
+    heads = [wrap(head, HEAD_WIDTH, break_long_words=False) for head in overview.heads]
+    body = [[escape(cell) for cell in overview.cells(row)] for row in overview.rows]
     columns = list(zip(*body, strict=True)) or [()] * len(heads)
     widths = [max(map(len, [*head, *column])) for head, column in zip(heads, columns, strict=True)]
     room = width - sum(widths[1:]) - len(widths[1:])
@@ -156,7 +156,7 @@ def _grid(shown: Overview, width: int) -> list[Text]:
     for number in range(tall):
         texts = [([""] * (tall - len(head)) + head)[number] for head in heads]
         lines.append(_line(texts, widths, ["dim"] * len(heads)))
-    styles = [STYLES[TONES.get(names[0], "mixed")] for _, names in shown.endings]
+    styles = [STYLES[TONES.get(names[0], "mixed")] for _, names in overview.endings]
     for cells in body:
         if len(cells[0]) > widths[0]:
             lines.append(Text(cells[0], "bold"))
@@ -174,32 +174,34 @@ def _line(cells: Sequence[str], widths: Sequence[int], styles: Sequence[str]) ->
     return line
 
 
-def forest_lines(shown: Overview, width: int) -> list[Text]:
+def forest_lines(overview: Overview, width: int) -> list[Text]:
     """Draw the differences with letters: dot, interval, margin band, and the numbers beside."""
-    found = [(escape(row.name), row.difference) for row in shown.rows if row.difference is not None]
-    beside = max((len(one.text) for _, one in found), default=0)
-    names = [len(name) for name, _ in found if len(name) <= width - beside - LEAST_PLOT]
+    differences = [
+        (escape(row.name), row.difference) for row in overview.rows if row.difference is not None
+    ]
+    beside = max((len(difference.text) for _, difference in differences), default=0)
+    names = [len(name) for name, _ in differences if len(name) <= width - beside - LEAST_PLOT]
     name_width = max(names, default=0)
     last = max(width - name_width - beside, LEAST_PLOT) - 3
 
     def place(value: float) -> int:
-        return round(last * shown.share(value))
+        return round(last * overview.share(value))
 
     lines = []
-    for name, one in found:
+    for name, difference in differences:
         letters = [" "] * (last + 1)
-        for column in range(place(-one.margin), place(one.margin) + 1):
+        for column in range(place(-difference.margin), place(difference.margin) + 1):
             letters[column] = "\u2591"
-        low, high = one.bounds or (one.centre, one.centre)
+        low, high = difference.bounds or (difference.centre, difference.centre)
         for column in range(place(low), place(high) + 1):
             letters[column] = "\u2500"
         letters[place(0.0)] = "\u2502"
-        letters[place(one.centre)] = "\u25cf"
+        letters[place(difference.centre)] = "\u25cf"
         if len(name) > name_width:
             lines.append(Text(name))
             name = ""
-        line = Text(f"{name.ljust(name_width)} ").append("".join(letters), STYLES[one.tone])
-        lines.append(line.append(f" {one.text.rjust(beside)}"))
+        line = Text(f"{name.ljust(name_width)} ").append("".join(letters), STYLES[difference.tone])
+        lines.append(line.append(f" {difference.text.rjust(beside)}"))
     return lines
 
 

@@ -54,7 +54,7 @@ def worst_change(run: Run) -> list[Shot]:
     flips, _ = find_flips(run)
     flip = next((flip for flip in flips if flip.tone != "better"), None)
     worst = (
-        min((one for one in run.rollouts if one.ok), key=_rank, default=None)
+        min((rollout for rollout in run.rollouts if rollout.ok), key=_rank, default=None)
         if flip is None
         else flip.other
     )
@@ -66,16 +66,17 @@ def worst_change(run: Run) -> list[Shot]:
     t_us = int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure.t_us)
     chosen = {worst.cell, *(() if flip is None else (flip.base.cell,))}
     beside = [
-        one
-        for one in run.by_scene[worst.scene]
-        if one.seed == worst.seed and (one.policy == worst.policy or one.renderer == worst.renderer)
+        rollout
+        for rollout in run.by_scene[worst.scene]
+        if rollout.seed == worst.seed
+        and (rollout.policy == worst.policy or rollout.renderer == worst.renderer)
     ]
     bases = run.info.bases
-    for one in sorted(beside, key=lambda one: bases.get(one.renderer) != worst.renderer):
+    for rollout in sorted(beside, key=lambda other: bases.get(other.renderer) != worst.renderer):
         if len(chosen) < SHOWN:
-            chosen.add(one.cell)
-    found = (_shot(run, one, t_us) for one in beside if one.cell in chosen)
-    return [shot for shot in found if shot is not None]
+            chosen.add(rollout.cell)
+    shots = (_shot(run, rollout, t_us) for rollout in beside if rollout.cell in chosen)
+    return [shot for shot in shots if shot is not None]
 
 
 def _rank(rollout: Rollout) -> tuple[int, float]:

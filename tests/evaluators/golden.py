@@ -184,7 +184,7 @@ def parity_table(root):
         if kept:
             scores = [scene_score(r.values, one.settings.scene_score).score for r in kept]
             tables[f"scene score, {name}"].add(
-                np.array(scores), np.array([marks[r.of.scene, r.of.rollout] for r in kept])
+                np.array(scores), np.array([marks[r.scored.scene, r.scored.rollout] for r in kept])
             )
     lines = [
         "| metric | logs | values | exactly equal | largest difference |",

@@ -196,7 +196,7 @@ def test_a_collision_is_the_first_contact_with_each_road_user_in_order_of_time()
     users = Tracks(
         ids=("far", "near", "middle"),
         kinds=tuple(kind for _, kind in places),
-        there=np.ones((3, n), bool),
+        is_present=np.ones((3, n), bool),
         xy=np.array([np.tile([place, 0.0], (n, 1)) for place, _ in places]),
         yaw=np.zeros((3, n)),
         size=np.ones((3, 2)),

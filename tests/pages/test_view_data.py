@@ -251,14 +251,14 @@ def test_a_page_keeps_its_size_and_says_what_it_leaves_out(watched_run, tmp_path
     size = write_page(run, tmp_path / "whole.html", asked).size
     smaller = write_page(run, tmp_path / "smaller.html", asked, size - 15_000)
     assert size - 400_000 < smaller.size <= size - 15_000
-    assert len(smaller.shown) == 2
+    assert len(smaller.cells) == 2
     assert any(re.match(r"Every \w+ camera frame is kept", note) for note in smaller.notes)
     least = write_page(run, tmp_path / "least.html", asked, size // 5)
-    assert len(least.shown) == 1
+    assert len(least.cells) == 1
     assert least.notes[0].startswith("No room for 1\u00a0")
     index = documents(least.path.read_text())["index"]
     assert sum(cell["here"] for cell in index["cells"]) == 1
-    assert {f"cell-{cell.id}" for cell in least.shown} == set(documents(least.path.read_text())) - {
+    assert {f"cell-{cell.id}" for cell in least.cells} == set(documents(least.path.read_text())) - {
         "index"
     }
 

@@ -141,8 +141,10 @@ def _read(get: Get, location: Path) -> GaussianArrays:
     )
     colour = plane(meta["sh0"]["files"][0], n)
     constant = np.array(meta["sh0"]["codebook"])[colour[:, :3]]
-    rest = _harmonics(document.get("shN"), plane, n) if document.get("shN") else np.zeros((n, 0, 3))
-    sh = np.concatenate([constant[:, None], rest], axis=1)
+    harmonics = np.zeros((n, 0, 3))
+    if document.get("shN"):
+        harmonics = _harmonics(document.get("shN"), plane, n)
+    sh = np.concatenate([constant[:, None], harmonics], axis=1)
     pixels = plane(meta["quats"]["files"][0], n)
     three = (pixels[:, :3] / 255.0 - 0.5) * np.sqrt(2.0)
     quats = with_largest(three, np.clip(pixels[:, 3].astype(np.int64) - 252, 0, 3))

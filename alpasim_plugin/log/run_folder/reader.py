@@ -101,18 +101,18 @@ class Run:
         """
         if os.path.exists(table_path(root, SUMMARY)):
             return cls.read(root)
-        found = inspect_run(root)
-        damaged = {one.cell for one in found.damage}
+        inspection = inspect_run(root)
+        damaged = {one.cell for one in inspection.damage}
         with parsing(root, AGAIN, "manifests from which no table can be made"):
-            whole = [manifest for manifest in found.manifests if manifest.path not in damaged]
+            whole = [manifest for manifest in inspection.manifests if manifest.path not in damaged]
             table = rollout_table(whole)
         return cls(
             root,
             read_run_json(root),
             rollouts_of_table(table),
             metrics_in(table.column_names),
-            len(found.cells),
-            tuple(map(str, found.damage)),
+            len(inspection.cells),
+            tuple(map(str, inspection.damage)),
         )
 
     @property
@@ -139,19 +139,19 @@ class Run:
     @cached_property
     def by_scene(self) -> Mapping[str, Sequence[Rollout]]:
         """Give the rollouts of each scene."""
-        found: dict[str, list[Rollout]] = {}
+        rollouts: dict[str, list[Rollout]] = {}
         for rollout in self.rollouts:
-            found.setdefault(rollout.scene, []).append(rollout)
-        return found
+            rollouts.setdefault(rollout.scene, []).append(rollout)
+        return rollouts
 
     @cached_property
     def _scene_files(self) -> dict[str, Path]:
-        found: dict[str, Path] = {}
+        files: dict[str, Path] = {}
         for path in sorted((self.folder / SCENES).rglob("*.json")):
             scene_id = read_json(path).get("scene_id")
             if isinstance(scene_id, str):
-                found[scene_id] = path
-        return found
+                files[scene_id] = path
+        return files
 
     def scene_path(self, scene: str) -> Path | None:
         """Find the file of a scene's map, independent of how slashes in its name were encoded; None
@@ -213,12 +213,12 @@ class Run:
             A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty
             where neither exists.
         """
-        own = self.file_of(rollout, STEPS_NAME)
+        rollout_file = self.file_of(rollout, STEPS_NAME)
         keep = None
-        for name, value in zip(KEYS, rollout.cell, strict=True) if own is None else ():
+        for name, value in zip(KEYS, rollout.cell, strict=True) if rollout_file is None else ():
             keep = pc.field(name) == value if keep is None else keep & (pc.field(name) == value)
         return self._read_steps(
-            own or table_path(self.folder, STEPS), (*STEP_COLUMNS, "reason"), keep
+            rollout_file or table_path(self.folder, STEPS), (*STEP_COLUMNS, "reason"), keep
         )
 
     def _read_steps(

@@ -103,8 +103,8 @@ def _number(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-Own = dict[str, tuple[I64, F64]]  # metric -> (t_us (T,), value (T,)) of one rollout
-Series = dict[tuple[str, str, str, int], Own]
+CellSeries = dict[str, tuple[I64, F64]]  # metric -> (t_us (T,), value (T,)) of one rollout
+Series = dict[tuple[str, str, str, int], CellSeries]
 
 
 def series_by_cell(table: pa.Table) -> Series:
@@ -127,6 +127,6 @@ def series_by_cell(table: pa.Table) -> Series:
     )
     for row, t_us, value in rows:
         cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
-        own = series.setdefault(cell, {})
-        own[row["metric"]] = (t_us.values.to_numpy(), value.values.to_numpy())
+        cell_series = series.setdefault(cell, {})
+        cell_series[row["metric"]] = (t_us.values.to_numpy(), value.values.to_numpy())
     return series

@@ -95,15 +95,15 @@ class TableSchema:
             "number": pa.float64(),
             "flag": pa.bool_(),
         }
-        own = [column for column in self.columns if of_logs or not column.of_logs]
+        columns = [column for column in self.columns if of_logs or not column.of_logs]
         return pa.schema(
-            [(column.name, types[column.kind]) for column in (*own, *columns_of(metrics))]
+            [(column.name, types[column.kind]) for column in (*columns, *columns_of(metrics))]
         )
 
     def kinds(self, names: Sequence[str]) -> dict[str, Kind]:
         """Give the kinds of the columns of a file with these names, as far as they are known."""
-        own = [column for column in self.columns if column.name in names]
-        return {column.name: column.kind for column in (*own, *columns_of(metrics_in(names)))}
+        columns = [column for column in self.columns if column.name in names]
+        return {column.name: column.kind for column in (*columns, *columns_of(metrics_in(names)))}
 
     def check(self, path: Path, do_this: str = AGAIN) -> list[str]:
         """Compare the header of a file with the schema, and return the names of its columns.

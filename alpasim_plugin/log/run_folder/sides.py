@@ -179,9 +179,9 @@ class Side:
         averaged first, as the paper does.
         """
         values = self.raw(metric)
-        known = np.isfinite(values)
-        count = np.bincount(self.cell[known], minlength=len(self.cells))
-        total = np.bincount(self.cell[known], weights=values[known], minlength=len(self.cells))
+        finite = np.isfinite(values)
+        count = np.bincount(self.cell[finite], minlength=len(self.cells))
+        total = np.bincount(self.cell[finite], weights=values[finite], minlength=len(self.cells))
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def why_missing(self, cell: Cell, metric: str, values: F64) -> str:
@@ -224,7 +224,7 @@ class RolloutTable:
 
     Args:
         data: Rows with the columns of ``rollouts.parquet``, in memory or in files.
-        where: What is read, for messages.
+        location: What is read, for messages.
         reasons: (renderer, metric) -> why values are not valid; empty where that is unknown.
 
     Attributes:
@@ -236,11 +236,11 @@ class RolloutTable:
     def __init__(
         self,
         data: pa.Table | pads.Dataset,
-        where: str,
+        location: str,
         reasons: Callable[[str, str], str] = lambda renderer, metric: "",
     ) -> None:
         self._data = pads.dataset(data) if isinstance(data, pa.Table) else data
-        self._where = where
+        self._location = location
         self.reasons = reasons
         self._columns: dict[str, F64] = {}
         columns = self._data.schema.names
@@ -269,13 +269,13 @@ class RolloutTable:
         """
         for path in paths:
             ROLLOUTS_TABLE.check(path, AGAIN)
-        where = ", ".join(map(str, paths))
-        with parsing(where, AGAIN, "no tables that fit together"):
+        location = ", ".join(map(str, paths))
+        with parsing(location, AGAIN, "no tables that fit together"):
             schema = pa.unify_schemas(
                 [pq.read_schema(path) for path in paths], promote_options="permissive"
             )
             data = pads.dataset([str(path) for path in paths], schema=schema, format="parquet")
-        return cls(data, where, reasons)
+        return cls(data, location, reasons)
 
     @classmethod
     def of_table(
@@ -294,11 +294,12 @@ class RolloutTable:
             named: What cells call it; None: the same.
         """
         rows: dict[str, list[int]] = {}
-        for row, (renderer, own, _, _) in enumerate(self._keys):
-            if own == policy:
+        for row, (renderer, row_policy, _, _) in enumerate(self._keys):
+            if row_policy == policy:
                 rows.setdefault(renderer, []).append(row)
         return {
-            name: self._side(name, named or policy, np.array(mine)) for name, mine in rows.items()
+            name: self._side(name, named or policy, np.array(indices))
+            for name, indices in rows.items()
         }
 
     def failures(self) -> dict[str, int]:
@@ -314,9 +315,9 @@ class RolloutTable:
             if metric in self.metrics:
                 number, flag = self._read([metric, metric + VALID]).columns
                 value = number.cast(pa.float64()).to_numpy()
-                known = flag.cast(pa.bool_()).fill_null(False).to_numpy() & self._ok
-                known &= np.isfinite(value)
-                values[known] = value[known]
+                is_valid = flag.cast(pa.bool_()).fill_null(False).to_numpy() & self._ok
+                is_valid &= np.isfinite(value)
+                values[is_valid] = value[is_valid]
             self._columns[metric] = values
         return self._columns[metric]
 
@@ -324,7 +325,7 @@ class RolloutTable:
         return self._failure_class[row] or "unknown"
 
     def _read(self, names: Sequence[str]) -> pa.Table:
-        with parsing(self._where, AGAIN, "no readable parquet"):
+        with parsing(self._location, AGAIN, "no readable parquet"):
             return self._data.to_table(columns=list(names))
 
     def _side(self, renderer: str, policy: str, rows: I64) -> Side:

@@ -84,16 +84,16 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
         before_ns: When the lock was taken, by the clock of the file system; None: of any time.
     """
     removed = []
-    for at, folders, files in os.walk(root):
-        here = Path(at)
-        if here != root and LOCK in files:
+    for parent_name, folders, files in os.walk(root):
+        parent = Path(parent_name)
+        if parent != root and LOCK in files:
             folders.clear()
             continue
         for name in [*files, *folders]:
             matched = _TEMPORARY.fullmatch(name)
             if matched is None or _is_running(int(matched[1])):
                 continue
-            path = here / name
+            path = parent / name
             if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
                 continue
             if os.path.isdir(path) and not os.path.islink(path):
