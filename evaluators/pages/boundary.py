@@ -88,15 +88,15 @@ def _line_text(facts: JsonView, unit: str) -> str:
 def _stretch_text(stretch: JsonView, unit: str) -> str:
     """Say what happens at the points of a stretch."""
     low, high = (f"{stretch[end]:.4g}" for end in ("low", "high"))
-    where = f"at {low}" if low == high else f"from {low} to {high}"
-    where = f"{where} {unit}".rstrip()
+    place = f"at {low}" if low == high else f"from {low} to {high}"
+    place = f"{place} {unit}".rstrip()
     if not stretch["most"]:
-        return f"no failure {where}"
+        return f"no failure {place}"
     if stretch["least"] == stretch["seeds"]:
-        return f"fails {where}"
+        return f"fails {place}"
     least, most = stretch["least"], stretch["most"]
     counts = f"{least}" if least == most else f"{least} to {most}"
-    return f"fails {where} in {counts} of {stretch['seeds']} seeds"
+    return f"fails {place} in {counts} of {stretch['seeds']} seeds"
 
 
 def _area_text(areas: JsonView) -> str:
