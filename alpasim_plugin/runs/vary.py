@@ -32,6 +32,7 @@ from evaluators.statistics.boundary import (
     difference_of,
     median_boundary,
     next_points,
+    seeds_for_median,
     stretches_of,
     widest_gap,
 )
@@ -388,6 +389,7 @@ class BoundarySearch:
         return facts | {
             "stretches": [vars(stretch) for stretch in stretches_of(outcomes)],
             "median": None if median is None else vars(median),
+            "seeds_for_median": seeds_for_median(),
         }
 
 

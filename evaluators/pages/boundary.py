@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from alpasim_plugin.core.json_types import JsonView
 from evaluators.pages.charts import MUTED, VARIANT, Chart, chart_of, new_axes
-from evaluators.statistics.boundary import seeds_for_median
 from evaluators.statistics.boundary_words import apart_text, difference_text
 from evaluators.statistics.numbers import plural
 
@@ -80,8 +79,10 @@ def _line_text(facts: JsonView, unit: str) -> str:
         low, high = (f"{facts['median'][end]:.4g}" for end in ("low", "high"))
         text += f" (median boundary of seeds like these: {low} to {high} {unit}".rstrip()
         text += ", interval of 95 %)"
-    elif 1 < seeds < seeds_for_median():
-        text += f" ({seeds_for_median()} seeds can give an interval of their median boundary)"
+    elif 1 < seeds < facts["seeds_for_median"]:
+        text += (
+            f" ({facts['seeds_for_median']} seeds can give an interval of their median boundary)"
+        )
     return text
 
 

@@ -164,7 +164,12 @@ def record(stretches, **facts):
         "stopped": "",
         "differences": {},
         "variants": {
-            "clean/p": {"stretches": [vars(one) for one in stretches], "median": None} | facts
+            "clean/p": {
+                "stretches": [vars(one) for one in stretches],
+                "median": None,
+                "seeds_for_median": 6,
+            }
+            | facts
         },
     }
 

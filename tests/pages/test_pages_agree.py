@@ -225,6 +225,7 @@ def test_what_a_summary_says_survives_the_file(two_changes):
 ALLOWED = {
     "evaluators.statistics.numbers": {"*"},
     "evaluators.statistics.sentences": {"*"},
+    "evaluators.statistics.boundary_words": {"*"},
     "evaluators.statistics.opening": {"Run", "read_run"},
     "evaluators.statistics.decision": {"CAUSES", "Decision", "read_decision"},
     "evaluators.statistics.gate": {"GateVerdict"},
