@@ -28,6 +28,7 @@ from evaluators.statistics.boundary import (
     stretches_of,
 )
 from evaluators.statistics.boundary_area import AREA_PARTS, Point, claims_of, next_area_points
+from tests.calibration import table
 
 FINE = 2_000  # values of a range at which the truth is looked at
 Fails = Callable[[float], bool]  # value between 0 and 1 -> whether the drive fails
@@ -222,15 +223,6 @@ def medians(policies: int) -> Iterator[Sequence[str]]:
 
 # of 0.8 N(0.3, 0.05) + 0.2 N(0.8, 0.05): 0.8 Phi(z) = 0.5 at z = 0.3186
 MEDIAN = 0.3 + 0.05 * 0.3186
-
-
-def table(head: Sequence[str], rows: Iterator[Sequence[str]]) -> None:
-    """Print a table in Markdown."""
-    say("| " + " | ".join(head) + " |")
-    say("|" + " --- |" * len(head))
-    for row in rows:
-        say("| " + " | ".join(row) + " |")
-    say("")
 
 
 def main() -> None:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:  # slow to load
     from matplotlib.axes import Axes
 
 POINTS = "Large dots: the rollout failed; small ones: it did not."
-
-
 MOST_STRETCHES = 6  # that a sentence lists
 
 
@@ -41,7 +39,10 @@ def sentence_of(record: JsonView) -> str:
     if record["unreachable"]:
         texts.append(f"{plural(len(record['unreachable']), 'point')} cannot be built")
     missed = "smaller region" if is_area else "narrower change"
-    texts.append(f"driven {apart_text(record)} apart or closer: a {missed} would be missed")
+    condition = ", where the scene can be built" if is_area and record["unreachable"] else ""
+    texts.append(
+        f"driven {apart_text(record)} apart or closer{condition}: a {missed} would be missed"
+    )
     share = 100 * record["rollouts"] / record["grid_rollouts"]
     stopped = f", stopped: {record['stopped']}" if record["stopped"] else ""
     return (
@@ -123,8 +124,9 @@ def boundary_section(record: JsonView | None) -> dict[str, Any] | None:
 
 
 def chart(record: JsonView) -> Chart:
-    """Draw every driven point, a row for each variant and seed, and
-    between which neighbours the outcome changes."""
+    """Draw every driven point, a row for each variant and seed, and between which neighbours the
+    outcome changes.
+    """
     names = list(record["variants"])
     axes = new_axes(_label(record["parameter"], record["unit"]), "")
     axes.set_yticks(range(len(names)), names, parse_math=False)

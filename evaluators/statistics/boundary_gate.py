@@ -40,26 +40,7 @@ def boundary_verdict(
             compare.
     """
     earlier = record if stored is None else stored
-    if not record or not earlier:
-        raise InputError(
-            f"{stored_name if record else 'the run'}: it searched for no boundary",
-            "drive it with --vary KEY=LOW..HIGH/STEP, and name the run's folder",
-        )
-    for searched in (record, earlier):
-        if "first" not in searched:
-            raise InputError(
-                f"{stored_name or 'the run'}: its search was made by an earlier version of simrun",
-                "drive it again",
-            )
-    ranges = [
-        [searched[name] for name in ("parameter", "reachable", "spacing")]
-        for searched in (record, earlier)
-    ]
-    if ranges[0] != ranges[1]:
-        raise InputError(
-            f"{stored_name}: it searched along {ranges[1]}, the run along {ranges[0]}",
-            "drive both with the same --vary",
-        )
+    record, earlier = _comparable(record, earlier, stored_name)
     variants = variants_in(table)
     pairs = [(one, one) for one in variants if one.name in earlier["variants"]]
     if stored is None:
@@ -90,6 +71,37 @@ def boundary_verdict(
     parameters = np.atleast_1d(record["parameter"])
     about = f"about {' and '.join(parameters)} of this scene and these seeds"
     return GateVerdict(worst(outcomes), tuple(checks), failures, stored_name or "the run", about)
+
+
+def _comparable(
+    record: JsonView | None, earlier: JsonView | None, stored_name: str
+) -> tuple[JsonView, JsonView]:
+    """Return both searches, which went along the same points.
+
+    Raises:
+        InputError: One is missing, was made by an earlier version, or went along other points.
+    """
+    if not record or not earlier:
+        raise InputError(
+            f"{stored_name if record else 'the run'}: it searched for no boundary",
+            "drive it with --vary KEY=LOW..HIGH/STEP, and name the run's folder",
+        )
+    for searched in (record, earlier):
+        if "first" not in searched:
+            raise InputError(
+                f"{stored_name or 'the run'}: its search was made by an earlier version of simrun",
+                "drive it again",
+            )
+    ranges = [
+        [searched[name] for name in ("parameter", "reachable", "spacing")]
+        for searched in (record, earlier)
+    ]
+    if ranges[0] != ranges[1]:
+        raise InputError(
+            f"{stored_name}: it searched along {ranges[1]}, the run along {ranges[0]}",
+            "drive both with the same --vary",
+        )
+    return record, earlier
 
 
 def _checked(

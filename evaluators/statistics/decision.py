@@ -149,7 +149,11 @@ def scene_harm(candidate: Side, baseline: Side, metric: MetricInfo, scenes: Sequ
         scenes: In the order in which they were drawn.
     """
     pairs = Pairs(candidate, baseline, metric.name)
-    diff = pairs.there - pairs.here if metric.direction == "higher" else pairs.here - pairs.there
+    diff = (
+        pairs.base_values - pairs.values
+        if metric.direction == "higher"
+        else pairs.values - pairs.base_values
+    )
     of_scene: dict[str, list[float]] = {scene: [] for scene in scenes}
     for (_, scene, _), value in zip(candidate.cells, diff.tolist(), strict=True):
         of_scene[scene].append(value)

@@ -137,20 +137,20 @@ def pairs_within(
     of_fixers: list[Pair] = []
     of_policies: list[Pair] = []
     for policy in table.policies:
-        own = {variant.renderer: variant for variant in variants if variant.policy == policy}
-        base = next(iter(own))
-        if by_renderer_base is not None and by_renderer_base.renderer in own:
+        of_policy = {variant.renderer: variant for variant in variants if variant.policy == policy}
+        base = next(iter(of_policy))
+        if by_renderer_base is not None and by_renderer_base.renderer in of_policy:
             base = by_renderer_base.renderer
-        others = {name: base for name in own if name != base}
+        others = {name: base for name in of_policy if name != base}
         below = {
             name: other
             for name, other in bases.items()
-            if {name, other} <= own.keys() and base not in (name, other)
+            if {name, other} <= of_policy.keys() and base not in (name, other)
         }
         for pairs, partners in ((of_renderers, others), (of_fixers, below)):
             for name, other in partners.items():
-                key = name if len(table.policies) == 1 else own[name].name
-                pairs.append(Pair(key, own[name], own[other], other))
+                key = name if len(table.policies) == 1 else of_policy[name].name
+                pairs.append(Pair(key, of_policy[name], of_policy[other], other))
     if by_policy_base is not None:
         of_policies += [
             Pair(variant.name, variant, partner, partner.name)
@@ -162,7 +162,7 @@ def pairs_within(
 def compare_pairs(
     table: RolloutTable,
     blocks: Mapping[str, Sequence[Pair]],
-    known: MetricTable,
+    metric_table: MetricTable,
     base: RolloutTable | None = None,
     listed: int = LISTED,
 ) -> dict[str, DifferenceTable]:
@@ -172,7 +172,7 @@ def compare_pairs(
     Args:
         table: The rollouts of the first variant of each pair.
         blocks: What is compared.
-        known: What the metrics are.
+        metric_table: What the metrics are.
         base: The rollouts of the second variant of each pair; None: the same table.
         listed: How many missing cells to name per metric.
 
@@ -189,20 +189,20 @@ def compare_pairs(
             side = sides(variant.policy, variant.policy)[variant.renderer]
             base_side = base_sides(other.policy, variant.policy)[other.renderer]
             measured[block][key] = {
-                name: measure(side, base_side, known.info(name), baseline, listed=listed)
+                name: measure(side, base_side, metric_table.info(name), baseline, listed=listed)
                 for name in names
             }
-    return decided_together(measured, known)
+    return decided_together(measured, metric_table)
 
 
 def decided_together(
-    measured: Mapping[str, DifferenceTable], known: MetricTable
+    measured: Mapping[str, DifferenceTable], metric_table: MetricTable
 ) -> dict[str, DifferenceTable]:
     """Decide about differences that are read together, with Holm's correction for their number.
 
     Args:
         measured: BLOCK -> VARIANT -> METRIC -> what `measure` gave.
-        known: What the metrics are.
+        metric_table: What the metrics are.
     """
     p_values = {
         (block, variant, name): entry.p_value
@@ -210,11 +210,11 @@ def decided_together(
         for variant, entries in table.items()
         for name, entry in entries.items()
     }
-    p_corrected = corrected(p_values, known.primary)
+    p_corrected = corrected(p_values, metric_table.primary)
     return {
         block: {
             variant: {
-                name: decide(entry, known.info(name), p_corrected[block, variant, name])
+                name: decide(entry, metric_table.info(name), p_corrected[block, variant, name])
                 for name, entry in entries.items()
             }
             for variant, entries in table.items()
@@ -481,17 +481,17 @@ class Pairs:
     """Cells with a value on both sides, and those without."""
 
     def __init__(self, side: Side, base: Side, metric: str) -> None:
-        here = side.values(metric)
-        there = base.values(metric)
+        values = side.values(metric)
+        base_values = base.values(metric)
         self.index = side.place_in(base)
-        self.here = here
+        self.values = values
         # The last value stands for cells that the base does not have: index -1.
-        self.there = np.append(there, np.nan)[self.index]
-        self.both: Bool = np.isfinite(self.here) & np.isfinite(self.there)
-        self.mine = self.here[self.both]
-        self.base = self.there[self.both]
+        self.base_values = np.append(base_values, np.nan)[self.index]
+        self.both: Bool = np.isfinite(self.values) & np.isfinite(self.base_values)
+        self.mine = self.values[self.both]
+        self.base = self.base_values[self.both]
         self.scenes = side.scene[self.both]
-        self._sides = {"here": (side, here), "baseline": (base, there)}
+        self._sides = {"here": (side, values), "baseline": (base, base_values)}
         self.only_base = np.flatnonzero(base.place_in(side) < 0)
         self.n_missing = int(np.sum(~self.both)) + len(self.only_base)
 
@@ -507,11 +507,13 @@ class Pairs:
         """Name a cell without a pair, with side and cause."""
         policy, scene, seed = cell
         (side, values), (base, base_values) = self._sides.values()
-        here = side.why_missing(cell, metric, values)
-        there = base.why_missing(cell, metric, base_values)
-        if not there:
-            return MissingPair(policy, scene, seed, "here", f"here: {here}")
-        if not here:
-            return MissingPair(policy, scene, seed, "baseline", f"baseline: {there}")
-        why = f"both: {here}" if here == there else f"here: {here}; baseline: {there}"
+        reason = side.why_missing(cell, metric, values)
+        base_reason = base.why_missing(cell, metric, base_values)
+        if not base_reason:
+            return MissingPair(policy, scene, seed, "here", f"here: {reason}")
+        if not reason:
+            return MissingPair(policy, scene, seed, "baseline", f"baseline: {base_reason}")
+        why = f"here: {reason}; baseline: {base_reason}"
+        if reason == base_reason:
+            why = f"both: {reason}"
         return MissingPair(policy, scene, seed, "both", why)

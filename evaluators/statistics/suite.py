@@ -164,7 +164,7 @@ def change_of(
     is_cut = is_shared & (is_stopped != was_stopped) & (not metric.is_flag)
     is_pair = pairs.both & ~is_cut
     is_run = ran(side) & np.append(ran(base), False)[pairs.index]
-    is_neither = is_run & np.isnan(pairs.here) & np.isnan(pairs.there) & ~is_cut
+    is_neither = is_run & np.isnan(pairs.values) & np.isnan(pairs.base_values) & ~is_cut
     lone = [side.cells[i] for i in np.flatnonzero(~(is_pair | is_cut | is_neither)).tolist()]
     lone += [base.cells[i] for i in pairs.only_base.tolist()]
     missing = [pairs.cause(cell, metric.name) for cell in lone]
@@ -173,8 +173,8 @@ def change_of(
         metric,
         margin,
         side,
-        pairs.there,
-        pairs.here,
+        pairs.base_values,
+        pairs.values,
         is_pair,
         is_cut,
         int(np.sum(is_neither)),
