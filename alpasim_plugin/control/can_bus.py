@@ -353,8 +353,11 @@ class Exchange:
             return []
         self._has_answered = True
         renewed = [command for command in commands if self._renew(command, frame, t_us)]
-        answering = [] if is_early else [one for one in renewed if one.questions_ago == 0]
-        self.counts["late"] += len(answering) < len(renewed)
+        answering = []
+        if not is_early:
+            answering = [command for command in renewed if command.questions_ago == 0]
+        if len(answering) < len(renewed):
+            self.counts["late"] += 1
         return answering
 
     def _renew(self, command: _Command, frame: can.Message, t_us: int) -> bool:
