@@ -17,9 +17,12 @@ def apart_text(record: JsonView) -> str:
 
 
 def difference_text(difference: JsonView, unit: str) -> str:
-    """Say by how much more of a range a variant fails than its baseline, and at which points."""
+    """Say over how much more or less of a range a variant fails than its baseline, and at how many
+    points.
+    """
+    more = difference["more"]
     return (
-        f"fails over {fixed(difference['more'], 2, sign=True)}{unit} more: of "
+        f"fails over {fixed(abs(more), 2)}{unit} {'less' if more < 0 else 'more'}: of "
         f"{plural(difference['pairs'], 'paired drive')} {difference['gained']} fail anew and "
         f"{difference['lost']} no longer"
     )
