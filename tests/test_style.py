@@ -1,8 +1,11 @@
-"""Private names of other libraries, and names bound twice: docs/architecture.md has the rule."""
+"""Private names of other libraries, names bound twice, places that print and read, keywords:
+docs/architecture.md has the first rule.
+"""
 
 import ast
 import re
 from collections import Counter
+from functools import cache
 
 from tests.source_modules import REPO, dotted, foreign_names, modules
 
@@ -193,13 +196,82 @@ def test_one_place_chooses_by_device_and_sends_tensors_of_the_host_without_waiti
     assert found == set()
 
 
+@cache
+def files_of_tests():
+    """Return the syntax nodes of every file below tests/."""
+    return {
+        path.relative_to(REPO): tuple(ast.walk(ast.parse(path.read_text())))
+        for path in sorted((REPO / "tests").rglob("*.py"))
+    }
+
+
+# Function -> how many arguments stand before its `dtype`.
+BEFORE_DTYPE = {
+    "np.array": 1,
+    "np.asarray": 1,
+    "np.asanyarray": 1,
+    "np.ascontiguousarray": 1,
+    "np.asfortranarray": 1,
+    "np.require": 1,
+    "np.zeros": 1,
+    "np.ones": 1,
+    "np.empty": 1,
+    "np.zeros_like": 1,
+    "np.ones_like": 1,
+    "np.empty_like": 1,
+    "np.identity": 1,
+    "np.frombuffer": 1,
+    "np.fromfile": 1,
+    "np.fromiter": 1,
+    "np.fromstring": 1,
+    "np.loadtxt": 1,
+    "np.memmap": 1,
+    "np.full": 2,
+    "np.full_like": 2,
+    "np.sum": 2,
+    "np.mean": 2,
+    "np.prod": 2,
+    "np.cumsum": 2,
+    "np.cumprod": 2,
+    "np.eye": 3,
+    "np.arange": 3,
+    "np.linspace": 5,
+    "torch.as_tensor": 1,
+}
+
+
+def positional_dtypes(nodes):
+    """Return the calls whose type of numbers is told from its place alone."""
+    return [
+        f"line {node.lineno}: {ast.unparse(node)}"
+        for node in nodes
+        if isinstance(node, ast.Call)
+        and len(node.args) > BEFORE_DTYPE.get(dotted(node.func), len(node.args))
+    ]
+
+
+def test_the_type_of_numbers_has_its_keyword():
+    """A second argument of `np.zeros` or a third of `np.full` is easily taken for a size or a
+    value.
+    """
+    nodes = {module.path.relative_to(REPO): module.nodes for module in modules()}
+    nodes.update(files_of_tests())
+    calls = {str(path): positional_dtypes(inner) for path, inner in nodes.items()}
+    assert {path: lines for path, lines in calls.items() if lines} == {}
+
+
+def test_the_rule_of_keywords_sees_a_positional_type():
+    tree = ast.parse("np.zeros(3, bool); np.full(3, 1, dtype=bool); x.astype(bool)")
+    assert positional_dtypes(ast.walk(tree)) == ["line 1: np.zeros(3, bool)"]
+
+
 def test_no_file_of_tests_is_imported_by_another():
     """Builders that several files use lie in modules without tests: who moves a test or runs one
     file alone then changes nothing else.
     """
     imports = []
-    for path in sorted((REPO / "tests").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text())):
+    for path, nodes in files_of_tests().items():
+        for node in nodes:
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             elif isinstance(node, ast.Import):
@@ -207,7 +279,7 @@ def test_no_file_of_tests_is_imported_by_another():
             else:
                 continue
             imports += [
-                f"{path.relative_to(REPO)} imports {name}"
+                f"{path} imports {name}"
                 for name in names
                 if re.match(r"tests\.(\w+\.)*test_\w+$", name)
             ]

@@ -60,8 +60,8 @@ def _gather_references(references, render, mean4, mean2, each4, each2):
     share = np.float32(1.0) / np.float32(count)
     level = np.float32(1.0 / HALF)
     size = CHANNELS * width
-    row = np.empty(size, np.float32)
-    mean = np.empty(size, np.float32)
+    row = np.empty(size, dtype=np.float32)
+    mean = np.empty(size, dtype=np.float32)
     for b in range(batch):
         for y in range(height):
             i4 = y // CELL
@@ -107,7 +107,7 @@ def blend(repaired: Tensor, references: Tensor, heads: BlendHeads) -> tuple[Tens
     out = torch.empty_like(repaired)
     recorded = torch.empty_like(repaired[..., :1])
     whole = _array(repaired), *_sources(references, heads), out.numpy(), recorded.numpy()
-    none = np.empty((0, 0, 0), np.float32)
+    none = np.empty((0, 0, 0), dtype=np.float32)
     for image, pixels, weight, offset_px, correction, *made in zip(*whole, strict=True):
         _blend(image, pixels, weight, offset_px, correction, none, 1, 0, *made)
     return out, recorded
@@ -146,7 +146,7 @@ def enlarge(
             mixed = np.empty_like(image)
             recorded = np.empty_like(image[..., :1])
             of_image = (part[b] for part in sources)
-            more = np.empty((0, 0, 0), np.float32)
+            more = np.empty((0, 0, 0), dtype=np.float32)
             if finer is not None:
                 more = _enlarged_rows(finer[b], FINER_PX, band)
             _blend(image, *of_image, more, scale, first, mixed, recorded)
@@ -191,20 +191,20 @@ def _blend(
     x0, x1, fx = _between(width, scale, DETAIL * cells_across)
     v0, v1, fv = _between(height, scale * DETAIL, cells_down)
     u0, u1, fu = _between(width, scale * DETAIL, cells_across)
-    coarse_offset = np.empty((2, cells_across), np.float32)
-    coarse_correction = np.empty((CHANNELS, DETAIL * cells_across), np.float32)
+    coarse_offset = np.empty((2, cells_across), dtype=np.float32)
+    coarse_correction = np.empty((CHANNELS, DETAIL * cells_across), dtype=np.float32)
     # The two coarser rows around a row of pixels, by whether their number is odd; the next row of
     # pixels most often lies between the same two.
-    offset_rows = np.empty((count, 2, 2, width), np.float32)
-    correction_rows = np.empty((count, 2, CHANNELS, width), np.float32)
-    row_of = np.empty((count, 4), np.int64)
-    place = np.empty((4, width), np.uint32)
-    corners = np.empty((4, width), np.uint32)
-    shares = np.empty((4, width), np.float32)
-    looked_up = np.empty((CHANNELS, width), np.float32)
-    blended = np.empty((3, width), np.float32)
-    total = np.empty(width, np.float32)
-    share = np.empty(width, np.float32)
+    offset_rows = np.empty((count, 2, 2, width), dtype=np.float32)
+    correction_rows = np.empty((count, 2, CHANNELS, width), dtype=np.float32)
+    row_of = np.empty((count, 4), dtype=np.int64)
+    place = np.empty((4, width), dtype=np.uint32)
+    corners = np.empty((4, width), dtype=np.uint32)
+    shares = np.empty((4, width), dtype=np.float32)
+    looked_up = np.empty((CHANNELS, width), dtype=np.float32)
+    blended = np.empty((3, width), dtype=np.float32)
+    total = np.empty(width, dtype=np.float32)
+    share = np.empty(width, dtype=np.float32)
     row_of[:] = -1
     for i in range(len(repaired)):
         y = first_row + i
@@ -338,9 +338,9 @@ def _between(length, scale, count):
     """Return for each pixel of a row or column the values before and after it, ``scale`` pixels
     wide and ``count`` in number, and the share of the second.
     """
-    before = np.empty(length, np.uint32)
-    after = np.empty(length, np.uint32)
-    share = np.empty(length, np.float32)
+    before = np.empty(length, dtype=np.uint32)
+    after = np.empty(length, dtype=np.uint32)
+    share = np.empty(length, dtype=np.float32)
     last = count - 1
     for x in range(length):
         place = max((x + 0.5) / scale - 0.5, 0.0)

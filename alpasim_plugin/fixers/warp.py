@@ -116,9 +116,9 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         actor that was not there.
     """
     shape = target.depth.shape
-    x = np.empty(shape, np.float32)
-    y = np.empty(shape, np.float32)
-    held = np.empty(shape, np.uint8)
+    x = np.empty(shape, dtype=np.float32)
+    y = np.empty(shape, dtype=np.float32)
+    held = np.empty(shape, dtype=np.uint8)
     # A pixel p at depth z lies at z A p + b in the recorded frame's homogeneous pixels; A p is
     # linear along a row.
     project = recorded.K @ inverse(recorded.T_world_camera)[:3]
@@ -126,8 +126,8 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     b = project[:, :3] @ target.T_world_camera[:3, 3] + project[:, 3]
     depth = np.ascontiguousarray(target.depth)
     depth_then = np.ascontiguousarray(recorded.depth)
-    ground = np.zeros(shape, bool) if target.ground is None else target.ground
-    users = np.zeros(depth_then.shape, bool) if recorded.users is None else recorded.users
+    ground = np.zeros(shape, dtype=bool) if target.ground is None else target.ground
+    users = np.zeros(depth_then.shape, dtype=bool) if recorded.users is None else recorded.users
     _coordinates(depth, ground, depth_then, users, A, b, x, y, held)
     names, boxes = target.placed
     absent = np.full((4, 4), np.nan)
@@ -208,9 +208,9 @@ def _coordinates(depth, ground, depth_then, users, A, b, x, y, held):
     height, width = depth.shape
     rows_then, columns_then = depth_then.shape
     surfaces, of_user = depth_then.reshape(-1), users.reshape(-1)
-    place = np.empty(width, np.uint32)
-    distance = np.empty(width, np.float64)
-    is_inside = np.empty(width, np.bool_)
+    place = np.empty(width, dtype=np.uint32)
+    distance = np.empty(width, dtype=np.float64)
+    is_inside = np.empty(width, dtype=np.bool_)
     for row in range(height):
         v0 = row + 0.5
         ax = A[0, 1] * v0 + A[0, 2]
@@ -288,7 +288,7 @@ def _coordinates_on_box(depth, depth_then, ray, eye, walls, project, pixels, x, 
 
 def on_boxes(shape: tuple[int, int], boxes: SeenBoxes) -> Bool:
     """Return the pixels of a camera of ``shape`` rows and columns whose ray meets a box."""
-    out: Bool = np.zeros(shape, bool)
+    out: Bool = np.zeros(shape, dtype=bool)
     for ray, eye, walls, pixels in zip(*boxes, strict=True):
         _add_box(ray, eye, walls, pixels, out[slice(*pixels[:2]), slice(*pixels[2:])])
     return out

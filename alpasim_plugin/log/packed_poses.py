@@ -61,7 +61,7 @@ def packed_trajectories(xyz: F64, unit_quat: F64, t_us: I64, lengths: Sequence[i
         lengths: How many of the N poses each trajectory has.
     """
     data = bytearray(SAMPLE * len(t_us))
-    table = np.frombuffer(data, LAYOUT)
+    table = np.frombuffer(data, dtype=LAYOUT)
     for name, column in zip(NUMBERS, (*xyz.T, *unit_quat.T), strict=True):
         table[name] = column
     table["t_us"] = t_us

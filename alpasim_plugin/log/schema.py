@@ -145,7 +145,7 @@ def _checked_quats(xyz: F64, quat: F64, name: str) -> F64:
             f"{name}: pose {i}: position {np.round(xyz[i], 3).tolist()}, quaternion {np.round(quat[i], 6).tolist()}",
             f"give finite poses within {MAX_LOCAL_M / 1000:.0f} km of the scene's local origin: the log stores them in float32",
         )
-    return np.asarray(quat / norm, np.float64)
+    return np.asarray(quat / norm, dtype=np.float64)
 
 
 def wire_pose(transform: F64, name: str) -> common_pb2.Pose:
@@ -352,7 +352,7 @@ def read_poses(poses: Iterable[common_pb2.Pose], name: str) -> tuple[F64, F64]:
     """
     # Each attribute access makes a Python object, so vec and quat are fetched once a pose.
     rows = [(v.x, v.y, v.z, q.w, q.x, q.y, q.z) for v, q in ((p.vec, p.quat) for p in poses)]
-    table = np.array(rows, np.float64).reshape(-1, 7)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
     xyz = table[:, :3]
     quat = table[:, 3:]
     square = np.sum(quat * quat, axis=1)
@@ -383,7 +383,7 @@ def increasing_times(times: Sequence[int], name: str) -> np.ndarray[tuple[int], 
     Raises:
         InputError: They do not increase strictly, or exceed 63 bits.
     """
-    t_us = np.array(times, np.uint64)
+    t_us = np.array(times, dtype=np.uint64)
     late = np.flatnonzero((t_us[1:] <= t_us[:-1]) | (t_us[1:] > np.iinfo(np.int64).max)) + 1
     if len(late):
         i = int(late[0])

@@ -223,7 +223,7 @@ class VideoReader:
         stated = frame.side_data.get("DISPLAYMATRIX")
         if stated is None:
             return image
-        matrix = np.frombuffer(bytes(stated), np.int32).reshape(3, 3)[:2, :2]
+        matrix = np.frombuffer(bytes(stated), dtype=np.int32).reshape(3, 3)[:2, :2]
         turn = matrix / max(int(np.abs(matrix).max()), 1)
         (a, b), (c, d) = np.rint(turn).tolist()
         if np.abs(turn - np.rint(turn)).max() > SQUARE or abs(a * d - b * c) != 1:
@@ -409,5 +409,5 @@ def read_mp4(path: Path | str) -> Video:
         base = video.format.time_base
     if rate is None:
         raise InputError(f"{path}: no frame rate", "give a whole MP4 file")
-    t_us = np.array([round(frame.time * base * 1_000_000) for frame in decoded], np.int64)
+    t_us = np.array([round(frame.time * base * 1_000_000) for frame in decoded], dtype=np.int64)
     return Video(np.stack([frame.image for frame in decoded]), t_us, rate)

@@ -164,7 +164,7 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
 
 
 def _column(rows: Sequence[Mapping[str, float | None]], name: str) -> F64:
-    return np.array([row[name] for row in rows if row.get(name) is not None], np.float64)
+    return np.array([row[name] for row in rows if row.get(name) is not None], dtype=np.float64)
 
 
 def _sweep(rows: Sequence[dict[str, float | None]]) -> dict[str, float | None]:

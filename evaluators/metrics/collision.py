@@ -111,7 +111,7 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
         actor = swept.actor
         first = _first_contacts(rollout, swept)
         gap_m[step] = 0.0
-    touched = np.zeros((3, len(t_us)), np.bool_)
+    touched = np.zeros((3, len(t_us)), dtype=np.bool_)
     touched[side, step] = True
     front = touched[FRONT]
     rear = touched[REAR]
@@ -165,8 +165,8 @@ def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
     """Return at which steps something touches the ego that was found standing in a
     reconstruction.
     """
-    stands = np.array([name.startswith(STANDING_ID) for name in actors.ids], np.bool_)
-    touched = np.zeros(count, np.bool_)
+    stands = np.array([name.startswith(STANDING_ID) for name in actors.ids], dtype=np.bool_)
+    touched = np.zeros(count, dtype=np.bool_)
     touched[step[stands[actor]]] = True
     return touched
 
@@ -178,7 +178,7 @@ def _first_contacts(rollout: RolloutLog, swept: SweptContacts) -> list[MetricSer
     order = np.lexsort((began.t_s[swept.begin], swept.step))
     step, first = np.unique(swept.step[order], return_index=True)
     begin = swept.begin[order][first]
-    touched = np.zeros(len(t_us), np.bool_)
+    touched = np.zeros(len(t_us), dtype=np.bool_)
     touched[step] = True
     x_m, y_m = in_rig(began.xy[begin], rollout).T
     out = []

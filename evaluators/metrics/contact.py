@@ -58,7 +58,7 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
         no actor is present.
     """
     gap_m = np.full(len(t_us), np.inf)
-    none = np.zeros(0, np.int64)
+    none = np.zeros(0, dtype=np.int64)
     if len(actors) == 0:
         return Contacts(none, none, none), gap_m
     actors_at = actors.at(t_us)
@@ -98,7 +98,7 @@ def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us:
     and the last result decides. The order depends on the tree's layout, so the tree is built the
     same way here, for the steps with more than one contact.
     """
-    keep = np.ones(len(contacts.step), np.bool_)
+    keep = np.ones(len(contacts.step), dtype=np.bool_)
     actors_at = actors.at(t_us)
     for step in np.flatnonzero(np.bincount(contacts.step, minlength=len(t_us)) > 1):
         present = np.flatnonzero(actors_at.present[:, step])
@@ -167,7 +167,7 @@ def find_swept(
         handover_us: When the policy takes over. A contact before it belongs to the row before it,
             although the next row is the policy's.
     """
-    touch = np.zeros((len(actors), len(t_us)), np.bool_)
+    touch = np.zeros((len(actors), len(t_us)), dtype=np.bool_)
     touch[at_steps.actor, at_steps.step] = True
     between = _between(ego, actors, t_us, touch)
     forced = (between.t_s < (handover_us - t_us[0]) * 1e-6) & (
@@ -180,7 +180,7 @@ def find_swept(
     before[:, 1:] = touch[:, :-1]
     fresh = np.flatnonzero(~(before | began)[at_steps.actor, at_steps.step])
     onsets, order = _onsets(between, at_steps, fresh, ego, actors, t_us)
-    place_of = np.empty(len(order), np.int64)
+    place_of = np.empty(len(order), dtype=np.int64)
     place_of[order] = np.arange(len(order))
     # Rows with contact at their own time follow the latest beginning of that actor; the others are
     # the beginning's own row.
@@ -224,7 +224,7 @@ def _onsets(
 def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Found:
     """Find the first contact of each actor in each interval at whose start it does not touch."""
     # Cut the presence of each actor at the steps and at its own logged times.
-    pieces = [np.zeros((3, 0), np.int64)]
+    pieces = [np.zeros((3, 0), dtype=np.int64)]
     for a in range(len(actors)):
         logged = actors.times_of(a)
         knots = np.union1d(t_us, logged)

@@ -155,16 +155,16 @@ class ActorTable:
     def at(self, t_us: I64) -> ActorsAt:
         """Locate every actor at times ``(Q,)``, in any order."""
         shape = (len(self), len(t_us))
-        row = np.zeros(shape, np.int64)
+        row = np.zeros(shape, dtype=np.int64)
         fraction = np.zeros(shape)
-        present = np.zeros(shape, np.bool_)
+        present = np.zeros(shape, dtype=np.bool_)
         for a in range(len(self)):
             row[a], fraction[a], present[a] = self._locate(a, t_us)
         return ActorsAt(self, row, fraction, present)
 
     def boxes(self, actor: I64, t_us: I64) -> Footprints:
         """Return the boxes ``(M,)`` of actors at times ``(M,)`` at which they are present."""
-        row = np.zeros(len(actor), np.int64)
+        row = np.zeros(len(actor), dtype=np.int64)
         fraction = np.zeros(len(actor))
         for a in np.unique(actor):
             rows = np.flatnonzero(actor == a)

@@ -36,14 +36,14 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
             return []
         # The first image at or after each ego time; times after the last image have no row.
         images = sorted(images, key=lambda image: image.end_us)
-        ends = np.array([image.end_us for image in images], np.int64)
-        is_dark = np.array([is_black(decode(image)) for image in images], np.float64)
+        ends = np.array([image.end_us for image in images], dtype=np.int64)
+        is_dark = np.array([is_black(decode(image)) for image in images], dtype=np.float64)
         times = rollout.ego.t_us[rollout.ego.t_us <= ends[-1]]
         return [series("img_is_black", times, is_dark[np.searchsorted(ends, times, side="left")])]
     black: dict[int, bool] = {}
     for image in images:
         black[image.end_us] = black.get(image.end_us, False) or is_black(decode(image))
-    t_us = np.array(sorted(black), np.int64)
+    t_us = np.array(sorted(black), dtype=np.int64)
     before: dict[str, LoggedImage] = {}
     stuck: set[int] = set()
     for image in sorted(images, key=lambda image: image.end_us):
@@ -60,8 +60,8 @@ def evaluate_images(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
         if float(np.hypot(*(np.diff(e)[0] for e in moved))) > FROZEN_MOVE_M:
             stuck.add(image.end_us)
     return [
-        series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], np.float64)),
-        series("img_is_frozen", t_us, np.array([int(t) in stuck for t in t_us], np.float64)),
+        series("img_is_black", t_us, np.array([black[int(t)] for t in t_us], dtype=np.float64)),
+        series("img_is_frozen", t_us, np.array([int(t) in stuck for t in t_us], dtype=np.float64)),
     ]
 
 

@@ -92,7 +92,9 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
     enough = len(t_us) > nuplan.LEAST_INSTANTS
     moves = nuplan.motion(drive.ego) if enough else None
     against = (
-        drive.against_m >= nuplan.AGAINST_M if drive.has_map else np.zeros(len(t_us), np.bool_)
+        drive.against_m >= nuplan.AGAINST_M
+        if drive.has_map
+        else np.zeros(len(t_us), dtype=np.bool_)
     )
     margin_m = rss_margin_m(drive.ego, drive.tracks)
     impact_mps = np.full(len(t_us), np.nan)

@@ -55,7 +55,7 @@ def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
     step, lane = np.nonzero(near)
     areas = road.areas(lane)
     held = shapely.contains(areas, shapes[step])
-    in_one = np.zeros(len(near), np.bool_)
+    in_one = np.zeros(len(near), dtype=np.bool_)
     in_one[step[held]] = True
     in_union = np.zeros_like(in_one)
     gap_m = np.zeros(len(near))
@@ -83,8 +83,8 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
     lane = lane[inside]
     delta = road.heading_at(lane, xy[step]) - yaw[step]
     opposes = np.abs(wrap_angle(delta) if preset.wrap_heading else delta) > WRONG_HEADING_RAD
-    out = np.zeros(len(xy), np.bool_)
-    agreed = np.zeros(len(xy), np.bool_)
+    out = np.zeros(len(xy), dtype=np.bool_)
+    agreed = np.zeros(len(xy), dtype=np.bool_)
     out[step[opposes]] = True
     agreed[step[~opposes]] = True
     return out if preset.wrong_lane_rule == "any_opposes" else out & ~agreed
@@ -123,7 +123,7 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
             series("min_distance_to_lane_boundary_m", t_us, np.maximum(margin_m, 0.0)),
         ]
     held = containment(road, ego, xyz)
-    off = np.zeros(len(t_us), np.bool_)
+    off = np.zeros(len(t_us), dtype=np.bool_)
     is_decided = held.in_one | held.in_union
     undecided = np.flatnonzero(~is_decided)
     if len(road.edges) and len(undecided):

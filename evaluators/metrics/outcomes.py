@@ -242,7 +242,7 @@ def _in_danger(rollout: RolloutLog, scene: Scene, preset: Preset) -> Bool:
     """Return ``(T,)`` whether the ego would touch a road user within `DANGER_S`: at the last step of
     a rollout that its path ended, since nobody sees what comes then.
     """
-    out = np.zeros(len(rollout.ego.t_us), np.bool_)
+    out = np.zeros(len(rollout.ego.t_us), dtype=np.bool_)
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
     if ends_with_path(rig.xyz[1:, :2], scene):
         drive = ScoredRollout(rollout, scene, preset, rollout.ego)
@@ -265,7 +265,7 @@ def _slow(
     expected = np.minimum(fastest, usual)
     stands = engaged & (v < STAND_MPS)
     slow = engaged & (expected > LEAST_MPS) & (v < SLOW_SHARE * expected)
-    ahead = np.zeros(len(t_us), np.bool_)
+    ahead = np.zeros(len(t_us), dtype=np.bool_)
     steps_before_slow = np.flatnonzero(
         _recently((stands | slow)[::-1], -seconds[::-1])[::-1]
     )  # what comes before a slow step may excuse it
@@ -316,7 +316,7 @@ def actor_ahead(
     """
     origin = origin_of(rollout.ego_log, preset)
     actors = ActorTable(rollout, preset, origin)
-    out = np.zeros(len(steps), np.bool_)
+    out = np.zeros(len(steps), dtype=np.bool_)
     if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
         return out
     way = shapely.linestrings(line)

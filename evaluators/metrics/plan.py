@@ -70,7 +70,7 @@ def trajectory_table(
     centre = held(xyz + rotation @ T_rig_box[:3, 3], preset) - origin
     forward = rotation @ T_rig_box[:3, 0]  # box x in the world
     t_us = np.concatenate(
-        [np.zeros(0, np.int64), *(trajectory.t_us for trajectory in trajectories)]
+        [np.zeros(0, dtype=np.int64), *(trajectory.t_us for trajectory in trajectories)]
     )
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     return TrajectoryTable(t_us, centre, heading_of(forward), start)
@@ -83,7 +83,7 @@ def evaluate_plans(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[Me
     plans = [plan for plan in rollout.plans if len(plan.trajectory)]
     origin = origin_of(rollout.ego_log, preset)
     table = trajectory_table([plan.trajectory for plan in plans], rollout.T_rig_box, origin, preset)
-    now_us = np.array([plan.now_us for plan in plans], np.int64)
+    now_us = np.array([plan.now_us for plan in plans], dtype=np.int64)
     out = [
         series(
             "open_loop_collision",
@@ -180,7 +180,7 @@ def min_ade(
     usable = line_us[(line_us >= target.t_us[0]) & (line_us <= target.t_us[-1])]
     target_xyz = held(interpolate(target, usable)[:, :3, 3], preset) - origin
     sampled_plans = [plan for plan in plans if plan.samples]
-    now_us = np.array([plan.now_us for plan in sampled_plans], np.int64)
+    now_us = np.array([plan.now_us for plan in sampled_plans], dtype=np.int64)
     if preset.min_ade_rule == "by_index":
         return _min_ade_by_index(rollout, sampled_plans, usable, target_xyz, preset, origin)
     values = np.full((len(sampled_plans), len(preset.min_ade_horizons_s)), np.nan)
@@ -242,7 +242,7 @@ def _min_ade_by_index(
         for j, read in enumerate([read for read in reads if read < len(span)]):
             rows[j].append((plan.now_us, float(best[read])))
     return [
-        series(name, np.array([t for t, _ in row], np.int64), np.array([v for _, v in row]))
+        series(name, np.array([t for t, _ in row], dtype=np.int64), np.array([v for _, v in row]))
         for name, row in zip(_min_ade_names(preset), rows, strict=True)
         if row
     ]

@@ -118,7 +118,7 @@ def _extended_comfort(rollout: RolloutLog, preset: Preset, centre: Trajectory) -
     both reach.
     """
     plans = [plan for plan in rollout.plans if _reaches(plan)]
-    now_us = np.array([plan.now_us for plan in plans], np.int64)
+    now_us = np.array([plan.now_us for plan in plans], dtype=np.int64)
     origin = origin_of(rollout.ego_log, preset)
     alike = []
     for plan in plans:

@@ -46,7 +46,7 @@ class Polylines:
 
     def line_within(self, xyz: F64, radius_m: float) -> Bool:
         """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
-        out = np.zeros((len(xyz), self.n_lines), np.bool_)
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         point, segment = self._tree.query(
             shapely.points(xyz[:, :2]), predicate="dwithin", distance=radius_m + 1e-6
         )
@@ -58,7 +58,7 @@ class Polylines:
         """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in
         3-D.
         """
-        out = np.zeros((len(xyz), self.n_lines), np.bool_)
+        out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         if len(self.vertices):
             near = scipy.spatial.cKDTree(self.vertices).query_ball_point(xyz, radius_m)
             for i, vertices in enumerate(near):
@@ -79,7 +79,7 @@ class Polylines:
         plan view: that one must lie within ``height_m`` of the point's height, and the line whose
         such vertex is nearest in 3-D is taken.
         """
-        out = np.full(len(xyz), -1, np.int64)
+        out = np.full(len(xyz), -1, dtype=np.int64)
         start = np.concatenate(
             [[0], np.flatnonzero(np.diff(self.vertex_owner)) + 1, [len(self.vertices)]]
         )
@@ -97,7 +97,7 @@ class Polylines:
         """Return whether each footprint is nearer than a limit to a segment whose middle is at most
         ``height_m`` above or below it.
         """
-        out = np.zeros(len(footprints), np.bool_)
+        out = np.zeros(len(footprints), dtype=np.bool_)
         body, segment = self._tree.query(footprints, predicate="dwithin", distance=limit_m)
         middle = (self.start[segment, 2] + self.end[segment, 2]) / 2
         level = np.abs(middle - z[body]) <= height_m
@@ -117,7 +117,7 @@ class Road:
         self._preset = preset
         self._centre = Polylines([lane.centre for lane in self._lanes], origin)
         self._edges = lane_map.road_edges
-        self._areas: Geometries = np.full(len(self._lanes), None, object)
+        self._areas: Geometries = np.full(len(self._lanes), None, dtype=object)
         self._unions: dict[bytes, Any] = {}
         self._rings = lane_map.drivable_areas
 
@@ -125,7 +125,7 @@ class Road:
         """Return the prepared areas ``(M,)`` of lanes ``(M,)``; a drive comes near few lanes of a
         map, so they are built when asked for.
         """
-        is_needed = np.zeros(len(self._lanes), np.bool_)
+        is_needed = np.zeros(len(self._lanes), dtype=np.bool_)
         is_needed[lane] = True
         new = [k for k in np.flatnonzero(is_needed).tolist() if self._areas[k] is None]
         if new:
@@ -158,7 +158,7 @@ class Road:
         """All lanes and drivable areas as one surface."""
         outer = [ring - self.origin for ring in self._rings]
         rings = [ring_area(ring) for ring in outer]
-        areas = np.array([*self.areas(np.arange(len(self._lanes))), *rings], object)
+        areas = np.array([*self.areas(np.arange(len(self._lanes))), *rings], dtype=object)
         outlines = [*(lane.centre - self.origin for lane in self._lanes), *outer]
         return Surface(areas, outlines, self._preset.seam_m, self._preset.edge_height_m)
 
@@ -186,7 +186,7 @@ class Road:
         no border.
         """
         lane_data = self._lanes[lane]
-        chosen = np.zeros(self.surface.n_areas, np.bool_)
+        chosen = np.zeros(self.surface.n_areas, dtype=np.bool_)
         for k, other in enumerate(self._lanes):
             chosen[k] = (
                 lane_data.lane_id in other.successors or other.lane_id in lane_data.successors
@@ -248,7 +248,7 @@ def _lines(lines: Sequence[F64], origin: F64) -> Geometries:
     """
     flat = [line[:, :2] - origin[:2] for line in lines]
     shapes = [shapely.linestrings(np.repeat(xy, 2, axis=0) if len(xy) == 1 else xy) for xy in flat]
-    return np.array(shapes, object)
+    return np.array(shapes, dtype=object)
 
 
 _ROADS: deque[tuple[LaneMap, bytes, Preset, Road]] = deque(maxlen=8)

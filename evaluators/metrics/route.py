@@ -74,7 +74,7 @@ def moving(path: F64) -> I64:
     """
     away = [np.hypot(*(path - end).T) > STAND_M for end in (path[0], path[-1])]
     if not (away[0].any() and away[1].any()):
-        return np.zeros(1, np.int64)
+        return np.zeros(1, dtype=np.int64)
     first = int(np.argmax(away[0]))
     last = len(path) - 1 - int(np.argmax(away[1][::-1]))
     return np.concatenate([[0], np.arange(first, last + 1), [len(path) - 1]])
@@ -293,7 +293,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     lateral_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
     engaged = relevant(rollout)
     # A recording that stands at its end tells where to stop; one that goes on tells nothing more.
-    is_measured = np.ones(len(t_us), np.bool_)
+    is_measured = np.ones(len(t_us), dtype=np.bool_)
     if on is not None and moves_at_end(rollout.ego_log):
         is_measured = ~on.is_beyond
     so_far = progress_so_far(recorded_xy, ego)

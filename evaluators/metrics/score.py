@@ -150,8 +150,8 @@ def series(
         reason: Why steps are invalid; dropped where none is.
         keep_values: Leave values of invalid steps as they are (AlpaSim's tables do).
     """
-    ok = np.broadcast_to(np.asarray(valid, np.bool_), t_us.shape).copy()
-    values = np.array(np.broadcast_to(np.asarray(value, np.float64), t_us.shape))
+    ok = np.broadcast_to(np.asarray(valid, dtype=np.bool_), t_us.shape).copy()
+    values = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), t_us.shape))
     if not keep_values:
         values[~ok] = np.nan
     return MetricSeries(METRICS.shown(name), t_us, values, ok, "" if bool(ok.all()) else reason)

@@ -72,7 +72,7 @@ class ScoredRollout:
             return None
         step, lane = self._in_lanes
         boxes = self.boxes.shapes()
-        out = np.ones(len(self._xyz), np.bool_)
+        out = np.ones(len(self._xyz), dtype=np.bool_)
         out[step[shapely.covers(self.road.areas(lane), boxes[step])]] = False
         across = np.flatnonzero(out)
         row, lane = np.nonzero(self.road.lanes_near(self._xyz[across]))
@@ -97,9 +97,8 @@ class ScoredRollout:
         if beside is not None:
             step, lane = self._in_lanes
             beside = beside.copy()
-            beside[
-                step[np.array([self._lanes[k].is_intersection for k in lane.tolist()], np.bool_)]
-            ] = True
+            crosses = [self._lanes[k].is_intersection for k in lane.tolist()]
+            beside[step[np.array(crosses, dtype=np.bool_)]] = True
         return nuplan.time_to_collision(self.ego, self.tracks, self.hits, beside)
 
     def time_to_collision(self) -> Part:
@@ -143,7 +142,7 @@ class ScoredRollout:
             return None
         front = self.ego.centre + self.ego.size[0] / 2 * self.ego.heading
         t_us = self.ego.t_us
-        out = np.zeros(len(t_us), np.bool_)
+        out = np.zeros(len(t_us), dtype=np.bool_)
         line = np.column_stack([front, self._xyz[:, 2]])
         for signal in (one for one in self._signals if not one.pedestrians):
             for k, share in signal.crossings(line, self._origin):
@@ -189,7 +188,7 @@ class ScoredRollout:
         if not self.has_map:
             return NO_MAP
         step, lane = self._in_lanes
-        free = np.array([self._lanes[k].is_intersection for k in lane.tolist()], np.bool_)
+        free = np.array([self._lanes[k].is_intersection for k in lane.tolist()], dtype=np.bool_)
         away = np.full(len(self._xyz), np.inf)
         np.minimum.at(
             away,

@@ -41,7 +41,7 @@ def drawn_map(content: JsonView) -> dict[str, list[F64]]:
     def arrays(lines: Sequence[Any], least: int) -> list[F64]:
         """Return the lines of at least so many points."""
         return [
-            np.asarray(line, np.float64)[:, :2]
+            np.asarray(line, dtype=np.float64)[:, :2]
             for line in lines
             if line is not None and len(line) >= least
         ]

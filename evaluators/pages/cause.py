@@ -342,7 +342,7 @@ def _newest(images: Sequence[LoggedImage], t_us: int) -> LoggedImage | None:
 
 def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:
     """Return rig coordinates ``(N, 2)`` in world centimetres, without rows of NaN."""
-    points = np.asarray(xy, np.float64).reshape(-1, 2)
+    points = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
     points = points[np.isfinite(points).all(axis=1)]
     rig = np.column_stack([points, np.zeros(len(points))])
     return place.cm(transform_points(T_world_rig, rig)[:, :2])

@@ -113,10 +113,10 @@ def chart(decision: Decision, metric: MetricInfo) -> Chart:
     """Draw the confidence sequence of a metric over scenes, with the margin."""
     looks = decision["looks"]
     scale, unit = _scale(metric)
-    scenes = np.array([look["n_scenes"] for look in looks], np.float64)
+    scenes = np.array([look["n_scenes"] for look in looks], dtype=np.float64)
     states = [look["metrics"][metric.name] for look in looks]
     numbers = [[state["diff"], *state["interval"]] for state in states]
-    diff, low, high = scale * np.array(numbers, np.float64).T  # None becomes NaN
+    diff, low, high = scale * np.array(numbers, dtype=np.float64).T  # None becomes NaN
     worse = -1.0 if metric.direction == "higher" else 1.0
     margin = scale * worse * decision["question"]["metrics"][metric.name]["margin"]
     limits = [margin, -margin] if metric.direction == "none" else [margin]

@@ -47,14 +47,16 @@ class Place:
 
     def cm(self, xy: npt.ArrayLike) -> list[list[int]]:
         """Return ``(N, 2)`` world metres as x and y in whole centimetres."""
-        scaled = np.rint((np.asarray(xy, np.float64).reshape(-1, 2) - self.origin) * 100.0).astype(
-            int
-        )
+        scaled = np.rint(
+            (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self.origin) * 100.0
+        ).astype(int)
         return [scaled[:, 0].tolist(), scaled[:, 1].tolist()]
 
     def ms(self, t_us: I64 | Sequence[int]) -> list[int]:
         """Return times ``(N,)`` in whole milliseconds."""
-        return np.rint((np.asarray(t_us, np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        return (
+            np.rint((np.asarray(t_us, dtype=np.int64) - self.zero_us) / 1000.0).astype(int).tolist()
+        )
 
     def track(self, trajectory: Trajectory) -> dict[str, list[int]]:
         """Return a trajectory as t (ms), x, y (cm) and a (heading, mrad; continuous, so that it can
@@ -71,7 +73,7 @@ class Place:
 
 def mrad(yaw: npt.ArrayLike) -> list[int]:
     """Return headings ``(N,)`` in radians as continuous whole milliradians."""
-    return np.rint(np.unwrap(np.asarray(yaw, np.float64)) * 1000.0).astype(int).tolist()
+    return np.rint(np.unwrap(np.asarray(yaw, dtype=np.float64)) * 1000.0).astype(int).tolist()
 
 
 def rounded(values: F64) -> list[float | None]:
@@ -218,7 +220,7 @@ def curves(steps: pa.Table, place: Place) -> JsonObject:
     metrics: JsonObject = {}
     for metric, of_metric in rows.items():
         times_us, values, reasons = zip(*of_metric, strict=True)
-        metrics[metric] = {"t": place.ms(times_us), "v": rounded(np.array(values, float))}
+        metrics[metric] = {"t": place.ms(times_us), "v": rounded(np.array(values, dtype=float))}
         why = "; ".join(dict.fromkeys(filter(None, reasons)))
         if why:
             metrics[metric]["why"] = why

@@ -104,7 +104,7 @@ def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
     rows = [smaller(first, WIDTH_PX)]
     if others:
         small = [smaller(image, rows[0].shape[1] // len(others)) for image in others]
-        row = np.zeros((max(map(len, small)), *rows[0].shape[1:]), np.uint8)
+        row = np.zeros((max(map(len, small)), *rows[0].shape[1:]), dtype=np.uint8)
         step = row.shape[1] // len(others)
         for i, image in enumerate(small):
             row[: len(image), i * step : i * step + image.shape[1]] = image

@@ -197,7 +197,7 @@ def log_capital(draws: Draws, mean: F64 | float, sizes: F64) -> F64:
         mean: ``(...)`` or one number: the hypothesis is that the mean is at most this.
         sizes: From `bet_sizes`.
     """
-    center = np.asarray(mean, np.float64)[..., None]
+    center = np.asarray(mean, dtype=np.float64)[..., None]
     least_gain = -draws.reach - center
     with np.errstate(divide="ignore", invalid="ignore"):
         growth = np.log1p(np.minimum(sizes, _largest_bets(least_gain)) * (draws.x - center))

@@ -207,5 +207,5 @@ def nearest_lengths(values: Sequence[float]) -> F64:
     """Return the length of the range that is nearest to each of some sorted values: half the distance
     to each neighbour.
     """
-    halves = 0.5 * np.diff(np.asarray(values, float))
+    halves = 0.5 * np.diff(np.asarray(values, dtype=float))
     return np.pad(halves, (0, 1)) + np.pad(halves, (1, 0))

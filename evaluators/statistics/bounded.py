@@ -118,7 +118,7 @@ def _with_worst(values: F64, most: float, scale: float) -> tuple[F64, F64]:
     which widens the bounds and never narrows.
     """
     distinct, found = np.unique(
-        np.append(np.asarray(values, np.float64) / scale, most / scale), return_counts=True
+        np.append(np.asarray(values, dtype=np.float64) / scale, most / scale), return_counts=True
     )
     counts = found.astype(np.float64)
     if len(distinct) <= BINS:
@@ -141,7 +141,7 @@ def mean_bounds(values: F64, least: float, most: float) -> tuple[float, float]:
         >>> [round(bound, 3) for bound in mean_bounds(np.array([0.0] * 57 + [1.0] * 3), -1.0, 1.0)]
         [-0.026, 0.139]
     """
-    x = np.clip(np.asarray(values, np.float64), least, most)
+    x = np.clip(np.asarray(values, dtype=np.float64), least, most)
     return -upper_bound(-x, -least), upper_bound(x, most)
 
 

@@ -76,7 +76,7 @@ def normal_half_width(values: npt.ArrayLike) -> tuple[float | None, str]:
         >>> normal_half_width([1.0])
         (None, 'one rollout has no spread')
     """
-    x = np.asarray(values, np.float64)
+    x = np.asarray(values, dtype=np.float64)
     if len(x) < 2:
         return None, "one rollout has no spread"
     half = scaled(x)[1] * Z95 * float(np.std(scaled(x)[0], ddof=1)) / float(np.sqrt(len(x)))
@@ -106,7 +106,7 @@ def t_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
         >>> round(interval.low, 4), round(interval.high, 4)
         (-0.4841, 4.4841)
     """
-    x, scale = scaled(np.asarray(values, np.float64))
+    x, scale = scaled(np.asarray(values, dtype=np.float64))
     centre = float(np.mean(x)) * scale
     if len(x) < 2:
         return Interval(centre, reason=f"needs at least two {unit}, found {len(x)}")
@@ -130,7 +130,7 @@ def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple
             order, without numbers that no value has.
     """
     group = np.asarray(clusters)
-    x, scale = scaled(np.asarray(values, np.float64))
+    x, scale = scaled(np.asarray(values, dtype=np.float64))
     # Names become numbers; numbers are not sorted, as a run may have millions of cells.
     if not np.issubdtype(group.dtype, np.integer):
         group = np.unique(group, return_inverse=True)[1].reshape(-1)

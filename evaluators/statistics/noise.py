@@ -163,7 +163,7 @@ def tango_score(new: F64, gone: F64, n: int, margin: float) -> F64:
     c = -gone * margin * (1.0 - margin)
     share_gone = (np.sqrt(b * b - 8.0 * n * c) - b) / (4.0 * n)
     variance = n * (2.0 * share_gone + margin * (1.0 - margin))
-    return np.asarray((new - gone - n * margin) / np.sqrt(variance), np.float64)
+    return np.asarray((new - gone - n * margin) / np.sqrt(variance), dtype=np.float64)
 
 
 @lru_cache(maxsize=4096)

@@ -219,7 +219,7 @@ def in_front_of(upstream, policy=HostPolicy(), **settings):
 
 def holes(folder):
     """Write a mask whose left third is not trusted at all, so that noise enters there."""
-    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
     mask[:, : WIDTH // 3] = 0
     path = folder / "mask.png"
     cv2.imwrite(str(path), mask)

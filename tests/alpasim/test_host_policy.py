@@ -273,7 +273,7 @@ def opening(name):
 
 
 def seen(name, t_us, size=(48, 32)):
-    picture = encode_image(np.zeros((*size[::-1], 3), np.uint8))
+    picture = encode_image(np.zeros((*size[::-1], 3), dtype=np.uint8))
     camera_image = {"logical_id": "front", "frame_end_us": t_us, "image_bytes": picture}
     return egodriver_pb2.RolloutCameraImage(session_uuid=name, camera_image=camera_image)
 

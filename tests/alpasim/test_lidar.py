@@ -45,7 +45,7 @@ def test_points_of_a_plane_and_a_box_are_exact_but_at_edges(device):
     rays = lidar.rays()
     assert len(lidar.rows_deg) == 128
     xyz, bright = points_of(
-        rays, cameras, depths, [np.full((*d.shape, 3), 51, np.uint8) for d in depths]
+        rays, cameras, depths, [np.full((*d.shape, 3), 51, dtype=np.uint8) for d in depths]
     )
     found = np.linalg.norm(xyz, axis=1)
     error_m = np.abs(found - plain_lengths(xyz / found[:, None]))

@@ -89,7 +89,7 @@ def test_a_picture_without_paint_is_no_evidence():
     for rgb in (
         photograph(contrast=0),
         photograph(contrast=0, noise=40.0),
-        np.zeros((270, 480, 3), np.uint8),
+        np.zeros((270, 480, 3), dtype=np.uint8),
     ):
         assert judged(rgb, prepared()) is None
         assert judged(rgb, prepared(1.75)) is None
@@ -138,7 +138,7 @@ def test_paint_that_stays_where_the_recording_shows_it_is_no_evidence():
 def test_chance_is_one_half_and_pieces_at_the_edge_have_one_side():
     paint = top_hat(np.random.default_rng(2).integers(0, 255, (200, 300, 3), dtype=np.uint8))
     rows = np.arange(200)
-    ones = np.ones(200, np.int64)
+    ones = np.ones(200, dtype=np.int64)
     found = agreement(Pieces(rows, 100 * ones, 104 * ones), paint)
     assert found == pytest.approx(0.5, abs=0.05)
     assert agreement(Pieces(rows, 296 * ones, 300 * ones), paint) is not None

@@ -104,7 +104,7 @@ def test_answers_equal_the_fixer_in_this_process(upstream, overrides, tmp_path, 
         fixer_settings("onefixer", [*overrides, "noise=content"]),
         scene_id="scene",
     )
-    trusted = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    trusted = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
     trusted[:, : WIDTH // 3] = 0
     alpha = trusted_opacity(0.9, trusted, HEIGHT, WIDTH)
     for i, (asked, got) in enumerate(zip(frames, served, strict=True)):

@@ -123,7 +123,9 @@ def test_the_pinhole_of_a_lens_takes_each_direction_from_where_the_lens_puts_it(
 
 def test_a_pinhole_is_its_own_and_what_a_lens_does_not_see_is_black():
     assert straight_of(pinhole(64, 32), 64, 32).place is None
-    picture = straight_of(ftheta(False), 320, 180).image(np.full((180, 320, 3), 200, np.uint8))
+    picture = straight_of(ftheta(False), 320, 180).image(
+        np.full((180, 320, 3), 200, dtype=np.uint8)
+    )
     assert picture[0, 0].tolist() == [0, 0, 0]  # beyond the picture's curved edge
     assert picture[picture.shape[0] // 2, 160].tolist() == [200, 200, 200]
 
@@ -157,7 +159,7 @@ def test_a_picture_through_a_lens_is_the_scene_and_black_beyond_it():
     image = joined_image(sides, [covering])
     assert_allclose(image[90, 160, :2].astype(int), 128, atol=1)
     assert image[0, 0].tolist() == [0, 0, 0]
-    assert joined_image(sides, [np.zeros((height, width), np.float32)], 1)[0, 0] == 1.0
+    assert joined_image(sides, [np.zeros((height, width), dtype=np.float32)], 1)[0, 0] == 1.0
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_an_upstreams_failure_arrives_as_the_status_that_is_retried_or_not(
         (lambda data: b"<html>busy</html>", "no whole PNG"),
         (lambda data: data[:60] + bytes(40) + data[100:], "image"),
         (
-            lambda data: encode_image(np.zeros((20, 70, 3), np.uint8)),
+            lambda data: encode_image(np.zeros((20, 70, 3), dtype=np.uint8)),
             r"\(20, 70\) after \(32, 48\)",
         ),
     ],

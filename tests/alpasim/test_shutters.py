@@ -91,7 +91,7 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec,
     rows, columns = np.mgrid[:90, :160]
     expected = rows / 89 if shutter_type in (DOWN, UP) else columns / 159
     expected = (1 - expected if shutter_type in (UP, LEFT) else expected)[lens.part]
-    seen = np.ones_like(expected, bool) if lens.weight is None else lens.weight > 0
+    seen = np.ones_like(expected, dtype=bool) if lens.weight is None else lens.weight > 0
     assert not np.isnan(read[seen]).any()
     assert np.abs(read - expected)[seen].max() < 0.3 / 89
 
@@ -156,7 +156,7 @@ def test_what_the_lens_does_not_see_is_exposed_never():
     lens = lens_of(camera_of(ftheta(False), 320, 180))
     share = lens_shares(camera_of(ftheta(False), 320, 180), lens, "rows", backwards=False)
     sees = ~np.isnan(share)
-    used = np.zeros(lens.cover[::-1], bool)
+    used = np.zeros(lens.cover[::-1], dtype=bool)
     assert lens.resample is not None
     column, row = np.floor(lens.resample).astype(int).reshape(-1, 2).T
     for dx in (0, 1):

@@ -20,7 +20,7 @@ def video(*values):
 
 
 def failures(x):
-    grey = np.full((len(x), 10, 10, 3), 90, np.uint8)
+    grey = np.full((len(x), 10, 10, 3), 90, dtype=np.uint8)
     grey += np.arange(len(x), dtype=np.uint8)[:, None, None, None]
     return guard.check_frames(x, grey, grey, None)
 
@@ -40,8 +40,8 @@ def test_overshoot_at_a_few_pixels_is_not_out_of_range():
 
 
 def test_black_counts_only_where_the_render_is_not_black():
-    dark = np.full((1, 10, 10, 3), 10, np.uint8)
-    grey = np.full((1, 10, 10, 3), 90, np.uint8)
+    dark = np.full((1, 10, 10, 3), 10, dtype=np.uint8)
+    grey = np.full((1, 10, 10, 3), 90, dtype=np.uint8)
     assert guard.check_frames(video(0.0), dark, grey, None) == ["fixer-black"]
     assert guard.check_frames(video(0.0), dark, dark, None) == [""]
     assert guard.check_frames(video(0.0), grey, grey, None) == [""]

@@ -42,7 +42,7 @@ def test_an_opacity_of_one_everywhere_is_none():
     assert views.alpha is None
     (views,) = group_views([opaque[0], replace(opaque[1], alpha=None)], [], 5)
     assert views.alpha is None
-    hole = np.ones((32, 48), np.float32)
+    hole = np.ones((32, 48), dtype=np.float32)
     hole[0, 0] = 0.999
     (views,) = group_views([opaque[0], replace(opaque[1], alpha=hole)], [], 5)
     assert views.alpha[0, 0].min() == 1
@@ -73,12 +73,12 @@ def test_pixels_are_copied_so_that_a_renderer_may_reuse_its_buffers():
 
 def test_values_beyond_the_range_are_cut():
     video = torch.tensor([-3.0, 3.0]).view(1, 1, 1, 1, 2).expand(1, 3, 1, 1, 2)
-    (views,) = group_views([Frame(0, "front", np.zeros((1, 2, 3), np.uint8))], [], 1)
+    (views,) = group_views([Frame(0, "front", np.zeros((1, 2, 3), dtype=np.uint8))], [], 1)
     assert to_images(video, views.size)[0, 0, 0, :, 0].tolist() == [0, 255]
 
 
 def test_rounding_beyond_one_is_cut():
-    alpha = np.full((32, 48), 1.0005, np.float32)
+    alpha = np.full((32, 48), 1.0005, dtype=np.float32)
     alpha[0] = -0.0005
     (views,) = group_views([replace(moving_picture(1)[0], alpha=alpha)], [], 5)
     assert views.alpha is not None

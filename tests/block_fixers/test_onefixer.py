@@ -109,7 +109,7 @@ def test_a_step_equal_to_the_last_preview_is_not_computed_again(busy, alone):
         assert np.array_equal(pixels(list(repeated)), pixels(out[start:]))
     assert len(videos) == 2
     assert np.array_equal(pixels(out), alone[:13])
-    changed = replace(FRAMES[13], alpha=np.full(SIZE, 0.25, np.float32))
+    changed = replace(FRAMES[13], alpha=np.full(SIZE, 0.25, dtype=np.float32))
     session.preview(FRAMES[13:21], MAPS[13:21])
     session.step([changed, *FRAMES[14:21]], MAPS[13:21])
     assert len(videos) == 4, "an opacity alone makes another block"
@@ -194,13 +194,13 @@ def test_blocks_that_are_none_are_refused(busy):
     refused(session, [*FRAMES[:2], replace(FRAMES[2], camera="rear")], [])
     refused(session, [FRAMES[0], FRAMES[0]], [])
     refused(session, [replace(FRAMES[0], rgb=FRAMES[0].rgb.astype(np.float32))], [])
-    refused(session, [replace(FRAMES[0], alpha=np.ones((8, 8), np.float32))], [])
-    refused(session, FRAMES[:1], [np.zeros((8, 8, 3), np.uint8)])
+    refused(session, [replace(FRAMES[0], alpha=np.ones((8, 8), dtype=np.float32))], [])
+    refused(session, FRAMES[:1], [np.zeros((8, 8, 3), dtype=np.uint8)])
 
 
 @pytest.mark.parametrize("value", [np.nan, 1.2, -0.1, np.inf])
 def test_an_opacity_that_is_none_is_the_renderers_fault(busy, value):
-    alpha = np.ones(SIZE, np.float32)
+    alpha = np.ones(SIZE, dtype=np.float32)
     alpha[3, 4] = value
     with pytest.raises(RendererError):
         fixer(busy).step([replace(FRAMES[0], alpha=alpha)], MAPS[:1])

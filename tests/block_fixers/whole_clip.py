@@ -48,10 +48,10 @@ class Clip:
     def of(cls, frames, maps):
         """Stack frames of one camera and their maps; a frame without opacity counts as opaque."""
         alpha = [
-            np.ones(frame.rgb.shape[:2], np.float32) if frame.alpha is None else frame.alpha
+            np.ones(frame.rgb.shape[:2], dtype=np.float32) if frame.alpha is None else frame.alpha
             for frame in frames
         ]
-        times = np.array([frame.t_us for frame in frames], np.int64)
+        times = np.array([frame.t_us for frame in frames], dtype=np.int64)
         return cls(
             frames[0].camera,
             times,

@@ -83,10 +83,10 @@ def test_a_lens_joined_of_pinholes_shows_the_colours_of_its_rays(lens):
         x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
         ray = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(side.K).T
         rgb = colours(ray @ side.T_lens_pinhole[:3, :3].T).round().astype(np.uint8)
-        held = np.dstack([rgb, np.full((h, w), 255, np.uint8)])
+        held = np.dstack([rgb, np.full((h, w), 255, dtype=np.uint8)])
         if not frames:  # holds nowhere: its neighbours' references count
             held[:] = 7, 7, 7, 0
-        frames.append(Frame(0, "x", rgb, np.zeros((h, w), np.float32), references=(held,)))
+        frames.append(Frame(0, "x", rgb, np.zeros((h, w), dtype=np.float32), references=(held,)))
     out = joined("lens", sides, frames)
     rays = rays_of(spec)
     off = np.abs(out.rgb.reshape(-1, 3) - colours(rays.ray)).max(axis=1)

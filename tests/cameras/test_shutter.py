@@ -58,7 +58,7 @@ FAST = asked(se2(0, 0, 0), se2(0.6, 0, 0.05))
 def test_bands_hold_every_pixel_once_and_time_runs_along_the_axis(along, back, count):
     request = asked(se2(0, 0, 0), se2(0.6, 0, 0.05), along=along, back=back)
     times = np.full((HEIGHT, WIDTH), np.nan)
-    seen = np.zeros((HEIGHT, WIDTH), int)
+    seen = np.zeros((HEIGHT, WIDTH), dtype=int)
     for band in bands_of(request, count):
         assert band.exposed is None
         seen[band.rows, band.columns] += 1

@@ -17,7 +17,7 @@ def source(tmp_path):
     path = tmp_path / "in.mp4"
     with VideoWriter(path, Fraction(1001, 30000), Fraction(30000, 1001)) as video:
         for i in range(7):
-            video.write(np.full((36, 64, 3), 30 * i, np.uint8), i)
+            video.write(np.full((36, 64, 3), 30 * i, dtype=np.uint8), i)
     return path
 
 
@@ -129,12 +129,12 @@ def test_folders_that_make_no_clip_are_refused_and_nothing_is_left(tmp_path, cap
     mixed = pictures(tmp_path / "mixed")
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert cv2.imwrite(str(mixed / "frame_01.png"), np.zeros((20, 64, 3), np.uint8))
+    assert cv2.imwrite(str(mixed / "frame_01.png"), np.zeros((20, 64, 3), dtype=np.uint8))
     broken = pictures(tmp_path / "broken")
     (broken / "frame_02.png").write_bytes(b"no picture")
     deep = tmp_path / "deep"
     deep.mkdir()
-    assert cv2.imwrite(str(deep / "a.png"), np.zeros((36, 64, 3), np.uint16))
+    assert cv2.imwrite(str(deep / "a.png"), np.zeros((36, 64, 3), dtype=np.uint16))
     cases = [
         ([str(empty)], "no .png files"),
         ([str(mixed)], "frame_01.png is 64x20, the first is 64x36"),

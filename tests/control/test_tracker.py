@@ -23,7 +23,7 @@ TRACKER = make_controller("bicycle", VEHICLE)
 
 def plan_of(t_s, x, y, yaw):
     t, x_, y_, yaw_ = (
-        np.broadcast_to(np.asarray(v, np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw)
+        np.broadcast_to(np.asarray(v, dtype=np.float64), np.shape(t_s)) for v in (t_s, x, y, yaw)
     )
     with np.errstate(invalid="ignore"):  # some plans are broken on purpose
         return Trajectory(

@@ -150,8 +150,8 @@ def weights(folder, bait):
 
 
 def object_arrays(folder, bait):
-    np.save(folder / "evil.npy", np.array([bait], object), allow_pickle=True)
-    np.savez(folder / "evil.npz", a=np.array([bait], object))
+    np.save(folder / "evil.npy", np.array([bait], dtype=object), allow_pickle=True)
+    np.savez(folder / "evil.npz", a=np.array([bait], dtype=object))
     (folder / "evil.asl").write_bytes((folder / "evil.npy").read_bytes())
     return [
         ["score", "evil.asl", "--scene", "smoke/straight", "--out", "scored"],

@@ -14,7 +14,7 @@ from tests.drives.street import write_kitti, write_transforms
 
 def at_once(views, start, **rest):
     """Stand in for `fit_drive`."""
-    model = Reconstruction(start, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+    model = Reconstruction(start, {}, Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)))
     return FittedDrive(model, {views[0].name: (1.1, 1.0, 0.9)})
 
 

@@ -86,7 +86,7 @@ class Street:
                 ray[:, 2] < -1e-3, (self.ground(x) - at[2]) / np.minimum(ray[:, 2], -1e-3), far
             )
         best = np.where(t > 0, t, far)
-        kind = np.zeros(len(ray), int)
+        kind = np.zeros(len(ray), dtype=int)
         for side in (1.0, -1.0):
             t = np.where(
                 ray[:, 1] * side > 1e-6,
@@ -214,7 +214,7 @@ def write_colmap(folder, binary, model="SIMPLE_PINHOLE", bend=()):
     number = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5}[model]
     focal = (FOCAL,) if model.startswith("SIMPLE") else (FOCAL, FOCAL)
     p = (*focal, K[0, 2], K[1, 2], *bend)
-    coefficients = np.array([*bend, 0, 0, 0, 0][:4], float) if bend else None
+    coefficients = np.array([*bend, 0, 0, 0, 0][:4], dtype=float) if bend else None
     rows = []
     for i, x in enumerate(stations()):
         T = street.pose(x)

@@ -155,7 +155,7 @@ def test_a_recording_that_cannot_be_is_refused_and_leaves_nothing(
 
 def test_axes_that_both_fit_are_asked_for(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk", say_axes=False)
-    blank = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    blank = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
     for path in (folder / "images").iterdir():
         cv2.imwrite(str(path), blank)
     with pytest.raises(InputError):

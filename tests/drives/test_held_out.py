@@ -127,7 +127,7 @@ def test_a_held_out_photograph_is_compared_in_the_exposure_of_its_own_camera(mon
             pose = Street().pose(0.6 * i, shift_m)
             seen[camera, i] = PosedView(
                 PinholeCamera.from_pose(32, 16, K, pose),
-                np.zeros((16, 32, 3), np.uint8),
+                np.zeros((16, 32, 3), dtype=np.uint8),
                 f"{camera}-{i:06d}",
             )
             exposures[seen[camera, i].name] = (gain,) * 3
@@ -136,7 +136,7 @@ def test_a_held_out_photograph_is_compared_in_the_exposure_of_its_own_camera(mon
     empty = Reconstruction(
         cloud_from_points(np.zeros((3, 3)), np.zeros((3, 3))),
         {},
-        Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)),
+        Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)),
     )
     views = {"fitted": fitted, "held-out": held, "never-fitted": []}
     quality.measure(empty, views, exposures, lambda stage, done, total: None)
@@ -157,14 +157,14 @@ def test_coverage_is_measured_beside_the_path_whatever_way_a_camera_looks(monkey
         for i in range(4):
             pose = Street(bow_m=0.0).pose(2.0 * i)
             pose[:3, :3] = se2(0, 0, turn)[:3, :3] @ pose[:3, :3]
-            image = np.zeros((16, 32, 3), np.uint8)
+            image = np.zeros((16, 32, 3), dtype=np.uint8)
             views.append(
                 PosedView(PinholeCamera.from_pose(32, 16, K, pose), image, f"{camera}-{i}")
             )
     empty = Reconstruction(
         cloud_from_points(np.zeros((3, 3)), np.zeros((3, 3))),
         {},
-        Sky(np.zeros((HEIGHT, WIDTH, 3), np.float32)),
+        Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)),
     )
     quality.measure(
         empty, {"fitted": views, "held-out": [], "never-fitted": []}, {}, lambda *stage: None

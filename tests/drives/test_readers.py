@@ -65,7 +65,7 @@ def test_the_second_camera_of_a_turned_rig_stays_at_its_side(tmp_path):
     for name in ("image_l", "image_r"):
         (folder / name).mkdir(parents=True)
         for i in range(2):
-            cv2.imwrite(str(folder / name / f"{i:06d}.png"), np.zeros((4, 8), np.uint8))
+            cv2.imwrite(str(folder / name / f"{i:06d}.png"), np.zeros((4, 8), dtype=np.uint8))
     turns = Rotation.from_euler("yxz", [(100, 4, -7), (120, -3, 5)], degrees=True).as_matrix()
     poses = np.concatenate([turns, [[[5.0], [0.0], [9.0]], [[6.0], [0.1], [9.5]]]], axis=2)
     np.savetxt(folder / "poses.txt", poses.reshape(2, 12))

@@ -29,9 +29,9 @@ def track(x, y, yaw=0.0, z=0.0, t_us=None, n=None):
     given.
     """
     n = n or (len(t_us) if t_us is not None else max(np.size(a) for a in (x, y, yaw, z)))
-    t = np.arange(n, dtype=np.int64) * DT_US if t_us is None else np.asarray(t_us, np.int64)
-    xyz = np.stack([np.broadcast_to(np.asarray(a, float), n) for a in (x, y, z)], axis=1)
-    return Trajectory(t, xyz, quat_from_yaw(np.broadcast_to(np.asarray(yaw, float), n)))
+    t = np.arange(n, dtype=np.int64) * DT_US if t_us is None else np.asarray(t_us, dtype=np.int64)
+    xyz = np.stack([np.broadcast_to(np.asarray(a, dtype=float), n) for a in (x, y, z)], axis=1)
+    return Trajectory(t, xyz, quat_from_yaw(np.broadcast_to(np.asarray(yaw, dtype=float), n)))
 
 
 def car(name, poses, box=CAR):

@@ -143,8 +143,8 @@ class Tally:
         self.logs, self.values, self.equal, self.largest = 0, 0, 0, 0.0
 
     def add(self, got, want):
-        got = np.asarray(got, float)
-        want = np.asarray(want, float)
+        got = np.asarray(got, dtype=float)
+        want = np.asarray(want, dtype=float)
         same = (got == want) | (np.isnan(got) & np.isnan(want))
         off = np.where(same, 0.0, np.abs(np.where(same, 0.0, got) - np.where(same, 0.0, want)))
         self.logs, self.values, self.equal = (
@@ -175,7 +175,7 @@ def parity_table(root):
         numbers = {key: value for key, value in over_sweeps(reduced).items() if key in want}
         assert set(numbers) == set(want) - {"run_uuid", "run_name"}
         both = [(numbers[key], want[key]) for key in numbers if want[key] is not None]
-        tables[f"over sweeps, {name}"].add(*np.array(both, float).T)
+        tables[f"over sweeps, {name}"].add(*np.array(both, dtype=float).T)
         rows = json.loads((one.folder / one.aggregate / "results-summary.json").read_text())[
             "rollouts"
         ]

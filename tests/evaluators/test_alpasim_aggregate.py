@@ -116,7 +116,7 @@ def rollout(name, scene="s", n=4, absent=(), **values):
     }
     columns |= {"gt_dist_traveled_m": 50.0} | values
     made = [
-        series(key, line, np.broadcast_to(np.asarray(value, float), n))
+        series(key, line, np.broadcast_to(np.asarray(value, dtype=float), n))
         for key, value in columns.items()
         if key not in absent
     ]
@@ -204,7 +204,7 @@ def test_unprocessed_steps_keep_order_and_a_row_for_an_empty_metric():
     one = rollout("a", n=2)
     empty = replace(
         one,
-        series=(*one.series, series("plan_deviation", np.zeros(0, np.int64), np.zeros(0))),
+        series=(*one.series, series("plan_deviation", np.zeros(0, dtype=np.int64), np.zeros(0))),
     )
     rows = metrics_unprocessed_table([empty]).to_pylist()
     assert [row["timestamps_us"] for row in rows if row["name"] == "progress"] == [0, 100_000]

@@ -50,7 +50,7 @@ RECORDED = track(np.linspace(0.0, 50.0, 51), 0.0)
     ],
 )
 def test_distance_to_the_side_ignores_what_was_driven_past_the_end(path, at, away_m):
-    line = np.array(path, float)
+    line = np.array(path, dtype=float)
     point = np.array([at])
     distance_m, s = to_path(line, point)
     assert from_corridor(line, s, point, distance_m) == pytest.approx([away_m])

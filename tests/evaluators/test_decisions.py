@@ -36,7 +36,7 @@ def test_a_decision_stays_and_intervals_only_shrink_however_often_one_looks():
     assert answers[-1] == "good"
     assert answers == sorted(answers, key=["open", "good"].index)
     for name in values:
-        ends = np.array([state.metrics[name]["interval"] for state in states], np.float64)
+        ends = np.array([state.metrics[name]["interval"] for state in states], dtype=np.float64)
         ends = ends[np.isfinite(ends).all(axis=1)]
         assert np.all(np.diff(ends[:, 0]) >= -1e-9)
         assert np.all(np.diff(ends[:, 1]) <= 1e-9)

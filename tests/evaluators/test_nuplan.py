@@ -29,7 +29,8 @@ SERIES = {f"ego_{name}": name for name in ("jerk", "lon_jerk", "lat_jerk", "yaw_
 
 def states(rows):
     pose, velocity, accel = (
-        np.array([row[key] for row in rows], float) for key in ("pose", "velocity", "acceleration")
+        np.array([row[key] for row in rows], dtype=float)
+        for key in ("pose", "velocity", "acceleration")
     )
     t_us = np.array([row["time_us"] for row in rows])
     size = (FRONT_M + REAR_M, WIDTH_M)
@@ -47,7 +48,7 @@ def tracks(worlds):
         {(kind, one["id"]) for world in worlds for kind in kinds for one in world.get(kind, [])}
     )
     shape = (len(ids), len(worlds))
-    there = np.zeros(shape, bool)
+    there = np.zeros(shape, dtype=bool)
     xy = np.zeros((*shape, 2))
     yaw = np.zeros(shape)
     velocity = np.zeros((*shape, 2))
@@ -156,13 +157,13 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
     others = Tracks(
         ("a",),
         ("vehicle",),
-        np.ones(shape, bool),
+        np.ones(shape, dtype=bool),
         rng.uniform(-20, 20, (*shape, 2)),
         rng.uniform(-4, 4, shape),
         np.array([[4.0, 1.8]]),
         velocity,
     )
-    everyone = np.zeros(n, np.int64)
+    everyone = np.zeros(n, dtype=np.int64)
     steps = np.arange(n)
     first_s, last_s = nuplan.touching_s(ego, others, everyone, steps)
     for after_s in np.arange(0.0, 4.0, 0.05):
@@ -196,7 +197,7 @@ def test_a_collision_is_the_first_contact_with_each_road_user_in_order_of_time()
     users = Tracks(
         ids=("far", "near", "middle"),
         kinds=tuple(kind for _, kind in places),
-        is_present=np.ones((3, n), bool),
+        is_present=np.ones((3, n), dtype=bool),
         xy=np.array([np.tile([place, 0.0], (n, 1)) for place, _ in places]),
         yaw=np.zeros((3, n)),
         size=np.ones((3, 2)),

@@ -103,7 +103,7 @@ def test_closing_leaves_the_outer_border_where_the_map_has_it():
             lane_polygon(Lane(k, bend, grow(a), grow(b)))
             for k, a, b in (("in", 16, 19.98), ("out", 20.02, 24))
         ],
-        object,
+        dtype=object,
     )
     joined = closed_union(areas, 0.1)
     plain = shapely.union_all(areas)
@@ -269,7 +269,7 @@ def layouts(draw):
 @settings(max_examples=examples(15), deadline=None, derandomize=True)
 @given(layouts(), COORDINATE, COORDINATE, st.sampled_from([0.0, math.pi, math.pi / 2, 0.4, -2.0]))
 def test_random_layouts_agree_with_distances_point_by_point(rings, x, y, yaw):
-    areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], object)
+    areas = np.array([lane_polygon(_as_lane(ring)) for ring in rings], dtype=object)
     body = box(x, y, yaw)
     drivable = Surface(areas, [np.zeros((2, 3))] * len(rings), 0.0, 3.0)
     found = float(drivable.margin_m(np.array([shapely.Polygon(body)]), np.array([[x, y, 0.0]]))[0])

@@ -29,7 +29,7 @@ T = np.arange(0.0, 12.0, DT_S)
 
 
 def track(x, y=0.0):
-    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
     xyz = np.stack([x, y, np.zeros(len(x))], axis=1)
     return Trajectory(
         (np.arange(len(x)) * round(DT_S * 1e6)).astype(np.int64),
@@ -40,7 +40,7 @@ def track(x, y=0.0):
 
 def travelled(v):
     """Return how far speeds ``(T,)`` lead."""
-    return np.concatenate([[0.0], np.cumsum(np.asarray(v, float)[:-1] * DT_S)])
+    return np.concatenate([[0.0], np.cumsum(np.asarray(v, dtype=float)[:-1] * DT_S)])
 
 
 def drive(ego, recorded=None, actors=None):

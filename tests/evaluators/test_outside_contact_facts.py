@@ -17,9 +17,9 @@ CENTRE_AHEAD_M = (4.049 - 1.127) / 2
 
 
 def poses(rows, t_us, ahead_m=0.0):
-    x, y, yaw = np.array(rows, float).T
+    x, y, yaw = np.array(rows, dtype=float).T
     xyz = np.stack([x + ahead_m * np.cos(yaw), y + ahead_m * np.sin(yaw), np.zeros_like(x)], axis=1)
-    return Trajectory(np.array(t_us, np.int64), xyz, quat_from_yaw(yaw))
+    return Trajectory(np.array(t_us, dtype=np.int64), xyz, quat_from_yaw(yaw))
 
 
 def first_contacts(path):

@@ -74,7 +74,7 @@ def test_plans_without_a_common_time_have_no_deviation():
 
 
 def test_empty_plans_have_no_row():
-    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+    nothing = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
     plans = [LoggedPlan(0, DT_US, nothing), plan(1, np.arange(1.0, 5.0))]
     found = scored(rollout(drive(), plans=plans))
     assert found["open_loop_collision"].t_us.tolist() == [DT_US]
@@ -166,7 +166,7 @@ def test_without_samples_there_is_no_min_ade():
 
 
 def image(t_us, level, camera="front", suffix=".png"):
-    pixels = np.full((8, 12, 3), level, np.uint8)
+    pixels = np.full((8, 12, 3), level, dtype=np.uint8)
     return LoggedImage(camera, t_us, t_us, cv2.imencode(suffix, pixels)[1].tobytes())
 
 

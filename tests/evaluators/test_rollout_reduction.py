@@ -117,14 +117,14 @@ def test_gaps_of_steps_without_actors_are_skipped():
         "min_distance_to_obstacle_m",
         T,
         [0, 0, 7, 8, np.inf, np.inf],
-        np.array([1, 1, 1, 1, 0, 0], bool),
+        np.array([1, 1, 1, 1, 0, 0], dtype=bool),
         "nobody",
     )
     assert value("min_distance_to_obstacle_m", min_distance_to_obstacle_m=gap).value == 7.0
 
 
 def test_a_last_value_that_is_invalid_is_not_replaced_by_an_earlier_one():
-    one = series("progress", T, 0.5, np.array([1, 1, 1, 1, 1, 0], bool), "gone")
+    one = series("progress", T, 0.5, np.array([1, 1, 1, 1, 1, 0], dtype=bool), "gone")
     assert (value("progress", progress=one).value, value("progress", progress=one).reason) == (
         None,
         "gone",
@@ -132,7 +132,7 @@ def test_a_last_value_that_is_invalid_is_not_replaced_by_an_earlier_one():
 
 
 def test_metrics_on_their_own_time_line_are_cut_by_time():
-    t = np.array([150_000, 200_000, 400_000], np.int64)
+    t = np.array([150_000, 200_000, 400_000], dtype=np.int64)
     own = series("plan_deviation", t, [9.0, 1.0, 5.0])
     assert value("plan_deviation", plan_deviation=own).value == pytest.approx(3.0)
     assert value(

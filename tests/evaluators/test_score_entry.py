@@ -38,7 +38,10 @@ def broken_track(index, **values):
         (broken_track(1, xyz=np.nan), "a pose that is not finite at 100000 us"),
         (broken_track(1, quat=np.inf), "a pose that is not finite at 100000 us"),
         (broken_track(2, quat=[2.0, 0, 0, 0]), "a quaternion of length 2 at 200000 us"),
-        (Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4))), "no pose at all"),
+        (
+            Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4))),
+            "no pose at all",
+        ),
         (
             Trajectory(np.arange(3), np.zeros((2, 3)), np.zeros((3, 4))),
             "3 times, positions of shape (2, 3)",

@@ -17,7 +17,7 @@ CAR = (4.5, 1.8)
 
 
 def pair(a, b):
-    row = lambda *v: np.array([v], float)  # noqa: E731
+    row = lambda *v: np.array([v], dtype=float)  # noqa: E731
     start = np.subtract(b.xy, a.xy)[None]
     return Motions(
         start,

@@ -65,7 +65,7 @@ def values(log, preset, road=TWO_LANES):
 
 
 def image(t_us, bright, camera=FRONT_WIDE):
-    data = cv2.imencode(".png", np.full((4, 6, 3), bright, np.uint8))[1].tobytes()
+    data = cv2.imencode(".png", np.full((4, 6, 3), bright, dtype=np.uint8))[1].tobytes()
     return LoggedImage(camera, t_us - 30_000, t_us, data)
 
 

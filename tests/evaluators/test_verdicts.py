@@ -204,7 +204,7 @@ def test_variants_that_are_alike_differ_in_one_run_of_twenty_whatever_their_tail
     rng = np.random.Generator(np.random.Philox(scenes))
     draws = [rng.standard_cauchy(scenes) for _ in range(300)]
     draws += [rng.integers(-1, 2, scenes) * (rng.random(scenes) < 0.5) for _ in range(300)]
-    assert np.mean([sign_flip(np.asarray(x, float))[0] <= 0.05 for x in draws]) <= 0.075
+    assert np.mean([sign_flip(np.asarray(x, dtype=float))[0] <= 0.05 for x in draws]) <= 0.075
 
 
 def test_few_flips_are_counted_and_many_are_drawn_with_almost_the_same_answer():

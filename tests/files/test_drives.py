@@ -61,7 +61,9 @@ def colmap(model, names, points=True, camera="", places=None):
 def kitti(folder, calib, times=None):
     (folder / "image_2").mkdir(parents=True)
     for i in range(8):
-        cv2.imwrite(str(folder / "image_2" / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, np.uint8))
+        cv2.imwrite(
+            str(folder / "image_2" / f"{i}.png"), np.full((HEIGHT, WIDTH, 3), i, dtype=np.uint8)
+        )
     rows = [" ".join(f"{v:.9e}" for v in pose[:3].ravel()) for pose in poses(8)]
     (folder / "poses.txt").write_text("\n".join(rows))
     (folder / "calib.txt").write_text(calib)
@@ -332,7 +334,7 @@ def test_times_in_nanoseconds_are_refused(tmp_path):
 def test_the_page_of_a_drive_holds_no_markup_of_its_files(tmp_path):
     folder = transforms(tmp_path / "a\x1b[2J", NAMES[1:3], **{"<img src=x>\u202e": 1})
     drive = read_source(folder, need_files=False)
-    grey = np.zeros((4, 4, 3), np.uint8)
+    grey = np.zeros((4, 4, 3), dtype=np.uint8)
     shown = [("held-out", Comparison("<b>\x1b", grey, grey, 30.0, 0.9), "pictures/<b>\x1b.jpg")]
     quality = {
         "photographs": {},

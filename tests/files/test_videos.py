@@ -23,7 +23,7 @@ def video(path, matrix=None, tracks=1):
     """Write a video of a bright corner at the upper left, and put a display matrix a, b, c, d into
     its track's header.
     """
-    image = np.full((HEIGHT, WIDTH, 3), 30, np.uint8)
+    image = np.full((HEIGHT, WIDTH, 3), 30, dtype=np.uint8)
     image[:8, :16] = 230
     with av.open(str(path), "w") as container:
         for _ in range(tracks):

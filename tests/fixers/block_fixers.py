@@ -64,7 +64,10 @@ class ShiftsTime(Blend):
 
 class GivesFloats(Blend):
     def _mix(self, block):
-        return [replace(frame, rgb=np.full(frame.rgb.shape, np.nan, np.float32)) for frame in block]  # type: ignore[arg-type]
+        return [
+            replace(frame, rgb=np.full(frame.rgb.shape, np.nan, dtype=np.float32))
+            for frame in block
+        ]  # type: ignore[arg-type]
 
 
 class GuardSteps(Blend):

@@ -29,7 +29,7 @@ def moving_picture(
     for i in range(count):
         y = (i * 1) % 64
         x = (i * 3) % 64
-        alpha = np.ones(size, np.float32)
+        alpha = np.ones(size, dtype=np.float32)
         if holes:
             alpha[: height // 2, : width // 3] = 0.0
             alpha[height // 2 :, : width // 6] = 0.5

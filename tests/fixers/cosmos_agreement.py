@@ -109,7 +109,7 @@ def published_layers(image):
     lane = (b > 50) & (g > 0.45 * b) & (g < 0.88 * b)
     boundary = (r > 50) & (g > 0.11 * r) & (g < 0.35 * r) & (b < 0.35 * r)
     pole = (b > 22) & (b > 1.6 * r) & (g < 0.45 * b)
-    block = np.ones((5, 5), np.uint8)
+    block = np.ones((5, 5), dtype=np.uint8)
     lane, boundary = (
         cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, block) > 0
         for mask in (lane, boundary)

@@ -59,7 +59,7 @@ def read_layer(folder, layer):
             continue
         shape = label["labelData"]["shape3d"]
         kind = next(kind for kind in ("polyline3d", "surface", "cuboid3d") if kind in shape)
-        out.append((str(shape.get("attributes")), np.array(shape[kind]["vertices"], float)))
+        out.append((str(shape.get("attributes")), np.array(shape[kind]["vertices"], dtype=float)))
     return out
 
 

@@ -70,7 +70,7 @@ def test_published_conditioning_videos_hold_our_colours(shared_data, name):
     steps = np.linspace(0, 1, 25)[:, None]
     palette = np.concatenate(
         [
-            np.array(flat, float),
+            np.array(flat, dtype=float),
             *((1 - steps) * a + steps * b for a, b in np.array(list(BOX_COLOURS.values()))),
         ]
     )

@@ -85,7 +85,7 @@ def test_what_lies_in_the_box_of_a_road_user_is_never_ground():
     held = ground_hypothesis(WarpTarget(K, T, depth, {"car": car}, box), rig(0.0))
     assert (free[22:24, 30:34] > 0).all()
     assert (held[rear] == 0).all()
-    elsewhere = np.ones(depth.shape, bool)
+    elsewhere = np.ones(depth.shape, dtype=bool)
     elsewhere[rear] = False
     assert_array_equal(free[elsewhere & (depth < 5)], held[elsewhere & (depth < 5)])
 
@@ -140,7 +140,7 @@ def test_the_ground_is_where_a_ray_meets_the_plane_below_the_rig(height_m):
     T_rig_camera = FORWARD.copy()
     T_rig_camera[2, 3] = height_m
     view = WarpTarget(
-        K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), np.float32), NOBODY, {}
+        K, T_world_rig @ T_rig_camera, np.zeros((HEIGHT, WIDTH), dtype=np.float32), NOBODY, {}
     )
     depth = ground_hypothesis(view, T_world_rig)
     assert (depth > 0).any() == (height_m == 1.5)  # from too far above the road is no plane

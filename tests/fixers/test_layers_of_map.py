@@ -163,7 +163,7 @@ def filled(ring):
 
 @pytest.mark.parametrize("name", RINGS)
 def test_triangles_fill_the_ring_exactly(name):
-    ring = np.array(RINGS[name], float)
+    ring = np.array(RINGS[name], dtype=float)
     parts = filled(ring)
     assert len(parts) == len(ring) - 2 - 2 * (name == "touching itself")
     whole = shapely.make_valid(shapely.Polygon(ring))

@@ -12,7 +12,7 @@ from alpasim_plugin.fixers.warp import INCONSISTENT, VALID
 
 
 def reference(grey, holds):
-    image = np.full((1, 4, 4), grey, np.uint8)
+    image = np.full((1, 4, 4), grey, dtype=np.uint8)
     image[..., 3] = holds
     return image
 
@@ -24,7 +24,7 @@ def test_the_nearest_lies_on_top_and_what_is_doubted_is_not_shown():
         reference(2, [VALID, VALID, 0, INCONSISTENT]),
     )
     (out,) = fixer.step(
-        [Frame(0, "front", np.full((1, 4, 3), 9, np.uint8), references=references)], []
+        [Frame(0, "front", np.full((1, 4, 3), 9, dtype=np.uint8), references=references)], []
     )
     assert out.rgb[0, :, 0].tolist() == [1, 2, 9, 9]
     assert out.references == ()

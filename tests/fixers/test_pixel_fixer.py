@@ -86,7 +86,7 @@ def test_odd_sizes_are_padded_and_cropped(bundle, size, scale):
 
 
 def test_a_missing_map_is_a_black_one(bundle):
-    black = [np.zeros((*SIZE, 3), np.uint8)] * len(FRAMES)
+    black = [np.zeros((*SIZE, 3), dtype=np.uint8)] * len(FRAMES)
     without = pixels(run(session(bundle), FRAMES))
     assert np.array_equal(pixels(run(session(bundle), FRAMES, black)), without)
     assert np.array_equal(pixels(run(session(bundle, "uses_map=false"), FRAMES, MAPS)), without)
@@ -97,7 +97,7 @@ def test_a_refused_step_leaves_the_history(bundle):
     expected = run(session(bundle), FRAMES[:3])
     fixer = session(bundle)
     run(fixer, FRAMES[:2])
-    holes = np.ones(SIZE, np.float32)
+    holes = np.ones(SIZE, dtype=np.float32)
     holes[3, 4] = np.nan
     with pytest.raises(RendererError):
         fixer.step([replace(FRAMES[2], alpha=holes)], ())
@@ -197,7 +197,7 @@ def reading(tmp_path_factory):
 
 
 def with_reference(frame, grey, holds=255):
-    image = np.full((*SIZE, 4), grey, np.uint8)
+    image = np.full((*SIZE, 4), grey, dtype=np.uint8)
     image[..., 3] = holds
     return replace(frame, references=(image,))
 
@@ -224,7 +224,9 @@ def test_cameras_with_and_without_references_are_one_batch_and_each_as_alone(rea
 
 def test_the_guard_never_keeps_the_render_where_a_reference_is_shown(reading):
     grey = replace(
-        FRAMES[0], rgb=np.full((*SIZE, 3), 20, np.uint8), alpha=np.ones(SIZE, np.float32)
+        FRAMES[0],
+        rgb=np.full((*SIZE, 3), 20, dtype=np.uint8),
+        alpha=np.ones(SIZE, dtype=np.float32),
     )
     (out,) = session(reading, "holes=render").step([with_reference(grey, 240)], [])
     assert out.rgb.mean() > 200
@@ -239,7 +241,7 @@ def test_more_steps_sample_from_noisier_sources(bundle):
 
 
 def test_a_reference_of_another_size_is_refused(reading):
-    wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), np.uint8),))
+    wrong = replace(FRAMES[0], references=(np.zeros((4, 4, 4), dtype=np.uint8),))
     with pytest.raises(InputError):
         session(reading).step([wrong], MAPS[:1])
 

@@ -44,7 +44,7 @@ def at(x, y=0.0, yaw=0.0):
 
 def wall(x_m, T_world_camera):
     """Depth of a wall across the street at ``x_m``, seen along x."""
-    return np.full((HEIGHT, WIDTH), x_m - T_world_camera[0, 3], np.float32)
+    return np.full((HEIGHT, WIDTH), x_m - T_world_camera[0, 3], dtype=np.float32)
 
 
 def picture(T_world_camera, depth, rgb=None, actors=NOBODY):
@@ -84,7 +84,7 @@ def test_what_stood_behind_something_is_doubted_and_what_lay_outside_is_not_ther
 
 
 def test_nothing_but_the_rotation_moves_the_sky():
-    sky = np.zeros((HEIGHT, WIDTH), np.float32)
+    sky = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
     one = picture(at(0.0), sky, columns())
     assert (
         np.abs(
@@ -100,7 +100,7 @@ def test_nothing_but_the_rotation_moves_the_sky():
 
 def test_the_pinholes_of_a_lens_show_together_what_one_of_them_does_not():
     here = at(0.0)
-    depth = np.zeros((HEIGHT, WIDTH), np.float32)
+    depth = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
     left, right = (picture(at(0.0, 0.0, yaw), depth) for yaw in (0.6, -0.6))
     view = WarpTarget(K, here, depth, {}, {})
     alone = warp(left, view)
@@ -119,11 +119,11 @@ def test_a_car_is_looked_up_where_it_was():
     now = se2(20.0, 0.0, 0.0, 0.75)
     then = se2(14.0, 3.0, 0.0, 0.75)
     here = at(0.0)
-    depth = np.zeros((HEIGHT, WIDTH), np.float32)
+    depth = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
     rows = slice(16, 19)
     car = slice(30, 34)
     depth[rows, car] = 18.0  # its rear
-    before = np.zeros((HEIGHT, WIDTH), np.float32)
+    before = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
     before[:, :] = 12.0
     out = warp(
         picture(here, before, columns(), {"car": then}),
@@ -144,7 +144,9 @@ def recorded(
     read=None,
 ):
     def none():
-        return np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((HEIGHT, WIDTH), np.float32)
+        return np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8), np.zeros(
+            (HEIGHT, WIDTH), dtype=np.float32
+        )
 
     return [
         RecordedFrame(i * step_us, "front", K, at(x, 0.0, yaw), {}, read or none)
@@ -187,7 +189,7 @@ def session(which="all", hysteresis=True, road_m=0.0):
         reads.append(1)
         return np.random.default_rng(0).integers(
             0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8
-        ), np.full((HEIGHT, WIDTH), 20.0, np.float32)
+        ), np.full((HEIGHT, WIDTH), 20.0, dtype=np.float32)
 
     car = Actor(
         "car",
@@ -209,9 +211,9 @@ def request(x, t_us):
     frame = Frame(
         t_us,
         "front",
-        np.zeros((HEIGHT, WIDTH, 3), np.uint8),
+        np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8),
         None,
-        np.full((HEIGHT, WIDTH), 20.0, np.float32),
+        np.full((HEIGHT, WIDTH), 20.0, dtype=np.float32),
     )
     return RenderRequest(t_us, spec, np.stack([at(x), at(x)]), {}), frame
 
@@ -222,7 +224,7 @@ def references_of(found, asked, frame):
 
 def test_the_ground_is_that_of_the_log_however_the_camera_is_said_to_be_mounted():
     asked, frame = request(10.0, 500_000)
-    frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), np.float32))  # nothing but holes
+    frame = replace(frame, depth=np.zeros((HEIGHT, WIDTH), dtype=np.float32))  # nothing but holes
     wrong = replace(
         asked, camera=replace(asked.camera, T_rig_camera=se2(0.0, 0.0, 0.0, 1.0) @ FORWARD)
     )

@@ -27,7 +27,7 @@ def test_blocks_are_made_as_they_are_asked_for():
     def frames():
         for i in range(30):
             taken.append(i)
-            yield Frame(i, "video", np.zeros((16, 16, 3), np.uint8)), None
+            yield Frame(i, "video", np.zeros((16, 16, 3), dtype=np.uint8)), None
 
     tally = StreamStats()
     for block in refine_frames(frames(), make_fixer("identity", scene_id="video")):  # type: ignore[arg-type]

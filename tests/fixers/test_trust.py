@@ -27,7 +27,7 @@ def trust_cells(text):
     """Return the shares of every cell ``(rows, columns, 2)``, in fifteenths."""
     size, _, digits = text.partition(":")
     columns, rows = (int(part) for part in size.split("x"))
-    return np.array([int(digit, 16) for digit in digits], np.uint8).reshape(rows, columns, 2)
+    return np.array([int(digit, 16) for digit in digits], dtype=np.uint8).reshape(rows, columns, 2)
 
 
 @pytest.mark.parametrize(
@@ -56,8 +56,8 @@ def test_cells_are_the_means_of_their_pixels(height, width):
 
 
 def test_a_render_that_stays_is_neither_recorded_nor_guessed_and_a_reference_is_never_guessed():
-    grey = np.zeros((32, 48, 3), np.float32)
-    zero = np.zeros((32, 48), np.float32)
+    grey = np.zeros((32, 48, 3), dtype=np.float32)
+    zero = np.zeros((32, 48), dtype=np.float32)
     assert trust(grey, grey, zero) == {
         RECORDED_SHARE: 0,
         GUESSED_SHARE: 0,

@@ -19,7 +19,7 @@ def at(x=0.0, y=0.0, z=1.5, yaw=0.0):
 
 
 def line(*points):
-    return np.array(points, float)
+    return np.array(points, dtype=float)
 
 
 def marked(*lines_and_paints):

@@ -11,15 +11,15 @@ LSB = 1.0 / 255.0
 
 def splats(means, scales=0.3, opacities=0.8, rgb=(1.0, 1.0, 1.0), quats=(1.0, 0.0, 0.0, 0.0)):
     """Build a cloud of plain colours; scalars and single rows are repeated."""
-    means = np.atleast_2d(np.asarray(means, np.float64))
+    means = np.atleast_2d(np.asarray(means, dtype=np.float64))
     n = len(means)
-    scales = np.asarray(scales, np.float64)
+    scales = np.asarray(scales, dtype=np.float64)
     scales = scales[:, None] if scales.ndim == 1 and len(scales) == n and n != 3 else scales
     return GaussianCloud(
         means,
-        np.broadcast_to(np.asarray(quats, np.float64), (n, 4)).copy(),
+        np.broadcast_to(np.asarray(quats, dtype=np.float64), (n, 4)).copy(),
         np.broadcast_to(scales, (n, 3)).copy(),
-        np.broadcast_to(np.asarray(opacities, np.float64), (n,)).copy(),
+        np.broadcast_to(np.asarray(opacities, dtype=np.float64), (n,)).copy(),
         np.broadcast_to(dc_from_rgb(rgb), (n, 3)).reshape(n, 1, 3).copy(),
     )
 

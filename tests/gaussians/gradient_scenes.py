@@ -76,16 +76,16 @@ def scene(
 ):
     """Build a scene; what is not given is random, and every number is one that float32 can hold."""
     rng = stream("gradient-tests", seed, "scene")
-    means = np.atleast_2d(np.asarray(means, float))
+    means = np.atleast_2d(np.asarray(means, dtype=float))
     n = len(means)
     arrays = (
         means,
-        np.log(np.broadcast_to(np.asarray(scales, float), (n, 3))),
+        np.log(np.broadcast_to(np.asarray(scales, dtype=float), (n, 3))),
         rng.normal(size=(n, 4))
         if quaternions is None
-        else np.broadcast_to(np.asarray(quaternions, float), (n, 4)),
-        logit(np.broadcast_to(np.asarray(opacities, float), (n,))),
-        rng.normal(size=(n, 4, 3)) * 0.2 if sh is None else np.asarray(sh, float),
+        else np.broadcast_to(np.asarray(quaternions, dtype=float), (n, 4)),
+        logit(np.broadcast_to(np.asarray(opacities, dtype=float), (n,))),
+        rng.normal(size=(n, 4, 3)) * 0.2 if sh is None else np.asarray(sh, dtype=float),
     )
     return Scene(*(a.astype(np.float32).astype(np.float64) for a in arrays), cam, **other)
 
@@ -126,7 +126,7 @@ def reference_loss(s, values):
         sigmoid(values["logit_opacities"]),
         values["sh"],
     )
-    behind = np.asarray(values["background"], float).reshape(1, 1, 3)
+    behind = np.asarray(values["background"], dtype=float).reshape(1, 1, 3)
     colour, alpha, depth = composite_reference(project_gaussians(cloud, s.camera), s.camera, behind)
     image = np.concatenate([colour, alpha[..., None], s.depth_weight * depth[..., None]], axis=2)
     return float((image * weights_of(s.camera)).sum())
@@ -151,7 +151,7 @@ def numeric_gradients(s):
     """Return central finite differences of the float64 reference."""
     values = {
         **{k: a.copy() for k, a in s.arrays().items()},
-        "background": np.array(s.background, float),
+        "background": np.array(s.background, dtype=float),
     }
     return {
         name: central_differences(lambda: reference_loss(s, values), array, 1e-6)

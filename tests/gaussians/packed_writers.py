@@ -38,12 +38,14 @@ def write_compressed(
 
 def write_splat(path, cloud):
     """Write a cloud as ``.splat``: constant colours in 8 bits, rotations in 7 bits and sign."""
-    rgb = 0.5 + C0 * np.asarray(cloud.sh, np.float64)[:, 0]
+    rgb = 0.5 + C0 * np.asarray(cloud.sh, dtype=np.float64)[:, 0]
     rgba = np.column_stack([rgb, cloud.opacities])
-    rows = np.zeros(len(cloud), _ROW)
+    rows = np.zeros(len(cloud), dtype=_ROW)
     rows["position"], rows["scale"] = cloud.means, cloud.scales
     rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
-    rows["rotation"] = np.clip(np.rint(np.asarray(cloud.quats, np.float64) * 128 + 128), 0, 255)
+    rows["rotation"] = np.clip(
+        np.rint(np.asarray(cloud.quats, dtype=np.float64) * 128 + 128), 0, 255
+    )
     path.write_bytes(rows.tobytes())
 
 

@@ -34,7 +34,7 @@ def camera_spec(width=256, height=144):
     f = width / (2 * np.tan(1.2 / 2))
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
     T = np.eye(4)
-    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
+    T[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=np.float64)
     T[:3, 3] = (1.7, 0.0, 1.5)
     return CameraSpec("front", width, height, K, T)
 

@@ -28,14 +28,14 @@ def write_sog(folder):
     low = logs.min(axis=0)
     high = logs.max(axis=0)
     sixteen = np.rint((logs - low) / (high - low) * 65535).astype(np.int64)
-    turned = np.zeros((N, 4), np.uint8)
+    turned = np.zeros((N, 4), dtype=np.uint8)
     for i, q in enumerate(quats):
         k = int(np.argmax(np.abs(q)))
         rest = np.delete(q * np.sign(q[k]), k)
         turned[i] = [*np.rint((rest / np.sqrt(2) + 0.5) * 255), 252 + k]
 
     def save(name, rgba, shape=(SIDE, SIDE)):
-        full = np.zeros((shape[0] * shape[1], 4), np.uint8)
+        full = np.zeros((shape[0] * shape[1], 4), dtype=np.uint8)
         full[:, 3] = 255
         full[: len(rgba), : rgba.shape[1]] = rgba
         image = cv2.cvtColor(full.reshape(*shape, 4), cv2.COLOR_RGBA2BGRA)

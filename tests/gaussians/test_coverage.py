@@ -30,13 +30,13 @@ def street(n=6000):
     )
     means = np.concatenate([ground, wall]).astype(np.float32)
     m = len(means)
-    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (m, 1))
+    quats = np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (m, 1))
     return GaussianCloud(
         means,
         quats,
-        np.full((m, 3), 0.3, np.float32),
-        np.full(m, 0.9, np.float32),
-        np.zeros((m, 1, 3), np.float32),
+        np.full((m, 3), 0.3, dtype=np.float32),
+        np.full(m, 0.9, dtype=np.float32),
+        np.zeros((m, 1, 3), dtype=np.float32),
     )
 
 

@@ -83,7 +83,7 @@ def test_packed_bits_are_spread_over_the_chunk(tmp_path):
 
 
 def test_harmonics_element_is_channel_major(tmp_path):
-    table = np.full(9, 128, np.uint8)
+    table = np.full(9, 128, dtype=np.uint8)
     table[1] = 255  # red, second coefficient
     raw = read_compressed_ply(
         write_compressed(tmp_path / "a.compressed.ply", 1, 1, (0, 0, 0, 0), table.tobytes(), 9)
@@ -100,7 +100,7 @@ def test_left_out_component_is_restored_in_its_place(largest):
     quat[largest] = np.sqrt(1 - quat @ quat)
     others = [round((q / np.sqrt(2) + 0.5) * 1023) for i, q in enumerate(quat) if i != largest]
     packed = largest << 30 | others[0] << 20 | others[1] << 10 | others[2]
-    assert_allclose(unpack_rotation(np.array([packed], np.uint32))[0], quat, atol=1e-3)
+    assert_allclose(unpack_rotation(np.array([packed], dtype=np.uint32))[0], quat, atol=1e-3)
 
 
 # --- .splat
@@ -132,11 +132,11 @@ def test_every_version_unpacks_to_the_same_numbers(tmp_path, version, degree):
     streams[0] = b"".join(int(v).to_bytes(3, "little", signed=True) for v in range(-9, 9))
     raw = as_stored(read_spz(write_spz(tmp_path / "a.spz", version, 6, degree, streams)))
     assert_array_equal(raw.means, np.arange(-9, 9).reshape(6, 3) / 4096)
-    assert_array_equal(raw.opacities, np.frombuffer(streams[1], np.uint8) / 255)
-    colour, scale = (np.frombuffer(s, np.uint8).reshape(6, 3) for s in streams[2:4])
+    assert_array_equal(raw.opacities, np.frombuffer(streams[1], dtype=np.uint8) / 255)
+    colour, scale = (np.frombuffer(s, dtype=np.uint8).reshape(6, 3) for s in streams[2:4])
     assert_allclose(raw.sh[:, 0], (colour / 255 - 0.5) / 0.15, rtol=1e-6, atol=1e-7)
     assert_allclose(raw.scales, np.exp(scale / 16 - 10))
-    harmonics = np.frombuffer(streams[5], np.uint8).reshape(6, -1, 3)
+    harmonics = np.frombuffer(streams[5], dtype=np.uint8).reshape(6, -1, 3)
     assert_allclose(raw.sh[:, 1:], (harmonics - 128.0) / 128, atol=1e-6)
     cloud, report = read_gaussians(tmp_path / "a.spz")
     assert report.n_kept == len(cloud) == 6
@@ -159,7 +159,7 @@ def test_smallest_three_rotation_is_restored(q):
     for i in range(4):
         if i != largest:
             word = word << 10 | (xyzw[i] < 0) << 9 | round(abs(xyzw[i]) * np.sqrt(2) * 511)
-    packed = np.frombuffer(struct.pack("<I", word), np.uint8)
+    packed = np.frombuffer(struct.pack("<I", word), dtype=np.uint8)
     wxyz = unpack_smallest_three(packed)[0]
     assert abs(np.linalg.norm(wxyz) - 1) < 1e-6
     assert_allclose(wxyz, xyzw[[3, 0, 1, 2]], atol=2.5e-3)
@@ -211,12 +211,12 @@ def test_chunks_that_do_not_cover_the_gaussians_are_refused(tmp_path):
 
 @pytest.mark.parametrize("system", ["RUB", "LUF", "FLU", "BRU", "RFU"])
 def test_an_ellipsoid_in_other_axes_keeps_its_place_and_its_shape(system):
-    means = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]], np.float32)
+    means = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 2.0]], dtype=np.float32)
     quats = unit(np.array([[0.9, 0.3, -0.2, 0.1], [0.2, -0.6, 0.5, 0.7]])).astype(np.float32)
-    scales = np.array([[0.1, 0.2, 0.4], [0.3, 0.05, 0.6]], np.float32)
-    sh = np.zeros((2, 1, 3), np.float32)
+    scales = np.array([[0.1, 0.2, 0.4], [0.3, 0.05, 0.6]], dtype=np.float32)
+    sh = np.zeros((2, 1, 3), dtype=np.float32)
     arrays = GaussianArrays(means, quats, scales, np.ones(2), sh)
-    M = np.array([DIRECTIONS[letter] for letter in system], np.float64).T
+    M = np.array([DIRECTIONS[letter] for letter in system], dtype=np.float64).T
     turned = in_ply_axes(arrays, system)
     assert_allclose(turned.means, means @ M.T, atol=1e-6)
     for row in range(2):

@@ -106,7 +106,7 @@ def test_sky_is_not_in_alpha_unless_asked_for():
     out = graph.render(camera(), {})
     assert out.alpha.max() == 0
     assert out.rgb.min() > 0.1
-    assert graph.render(camera(), {}).covered(np.ones((1, 1), np.float32)).alpha.min() == 1
+    assert graph.render(camera(), {}).covered(np.ones((1, 1), dtype=np.float32)).alpha.min() == 1
 
 
 def test_splitting_by_tile_loses_nothing():
@@ -130,7 +130,10 @@ def test_same_sky_seen_while_turning_moves_across_the_image():
 def test_a_tile_with_only_the_finest_level_is_left_to_sharp_cameras():
     """A kerb across a tile's border may have its middle in another tile at another size."""
     cloud = blobs((8, 0, 1))
-    levels = [(0.05, cloud, np.zeros(40, np.int64)), (0.1, cloud, np.ones(40, np.int64))]
+    levels = [
+        (0.05, cloud, np.zeros(40, dtype=np.int64)),
+        (0.1, cloud, np.ones(40, dtype=np.int64)),
+    ]
     graph = SceneGraph(nodes_by_tile("kerb", levels, usual_cell_m=0.1), [], SKY)
     names = [[one.node.name for one in choose(graph, camera(), {}, sharp)] for sharp in (0, 1)]
     assert names == [["kerb/1"], ["kerb/0", "kerb/1"]]

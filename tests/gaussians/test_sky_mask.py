@@ -26,7 +26,7 @@ def view(alpha, name="", **pose):
 
 
 def test_same_pose_at_twice_the_size_repeats_what_the_view_saw():
-    alpha = np.ones((18, 32), np.float32)
+    alpha = np.ones((18, 32), dtype=np.float32)
     alpha[:8] = 0.0
     share = SkyMask([view(alpha)]).share(camera(64, 36))
     assert_array_equal(share[:15], 1.0)
@@ -34,7 +34,7 @@ def test_same_pose_at_twice_the_size_repeats_what_the_view_saw():
 
 
 def test_turning_left_moves_the_skyline_to_the_right():
-    alpha = np.ones((18, 32), np.float32)
+    alpha = np.ones((18, 32), dtype=np.float32)
     alpha[:, 16:] = 0.0  # sky to the right of straight ahead
     share = SkyMask([view(alpha)]).share(camera(32, 18, yaw_rad=np.arctan(4 / 32)))
     columns = share[9] > 0.5
@@ -43,7 +43,7 @@ def test_turning_left_moves_the_skyline_to_the_right():
 
 
 def test_what_no_view_saw_is_no_sky():
-    clear = np.zeros((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
     turned = camera(32, 18, yaw_rad=np.arctan(4 / 32))
     share = SkyMask([view(clear)]).share(turned)
     assert share[9, :3].max() == 0.0  # to the left of the view's border
@@ -53,8 +53,8 @@ def test_what_no_view_saw_is_no_sky():
 
 def test_a_view_of_the_own_camera_comes_before_a_nearer_one_of_another():
     """A metre to the side of the path a neighbouring camera's eye is nearer than the own one's."""
-    clear = np.zeros((18, 32), np.float32)
-    hidden = np.ones((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
+    hidden = np.ones((18, 32), dtype=np.float32)
     mask = SkyMask(
         [
             view(clear, "front", x_m=0.0),
@@ -67,8 +67,8 @@ def test_a_view_of_the_own_camera_comes_before_a_nearer_one_of_another():
 
 
 def test_another_camera_of_the_rig_completes_what_the_own_one_did_not_see():
-    clear = np.zeros((18, 32), np.float32)
-    hidden = np.ones((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
+    hidden = np.ones((18, 32), dtype=np.float32)
     hidden[:, 16:] = 0.0
     mask = SkyMask([view(hidden, "front"), view(clear, "left", yaw_rad=0.5)])
     share = mask.share(camera(32, 18, yaw_rad=np.arctan(4 / 32)), "front")
@@ -79,7 +79,7 @@ def test_another_camera_of_the_rig_completes_what_the_own_one_did_not_see():
 
 def test_many_views_of_the_own_camera_leave_room_for_the_one_that_saw_the_rest():
     """Of a drive a camera has a view every second, and all of them lack what lies to the side."""
-    clear = np.zeros((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
     fronts = [view(clear, "front", x_m=float(x)) for x in range(20)]
     mask = SkyMask([*fronts, view(clear, "left", yaw_rad=0.5)])
     turned = camera(32, 18, x_m=5.0, yaw_rad=0.3)
@@ -88,15 +88,15 @@ def test_many_views_of_the_own_camera_leave_room_for_the_one_that_saw_the_rest()
 
 
 def test_a_camera_without_a_view_of_its_name_takes_the_nearest_that_shows_its_image():
-    clear = np.zeros((18, 32), np.float32)
-    hidden = np.ones((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
+    hidden = np.ones((18, 32), dtype=np.float32)
     mask = SkyMask([view(clear, "front"), view(hidden, "left", x_m=0.9, yaw_rad=0.9)])
     assert mask.share(camera(32, 18, x_m=1.0), "camera_front_wide_120fov").min() == 1.0
 
 
 def test_nearest_view_that_looks_the_same_way_is_taken():
-    clear = np.zeros((18, 32), np.float32)
-    hidden = np.ones((18, 32), np.float32)
+    clear = np.zeros((18, 32), dtype=np.float32)
+    hidden = np.ones((18, 32), dtype=np.float32)
     mask = SkyMask(
         [view(clear, x_m=0.0), view(hidden, x_m=10.0), view(clear, x_m=9.0, yaw_rad=np.pi)]
     )

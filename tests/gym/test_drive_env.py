@@ -33,7 +33,7 @@ from alpasim_plugin.gym.reward import Reward, Scorer  # noqa: E402
 SMALL = "cameras=[{width: 64, height: 36}]"
 SHORT = ("timing.duration_us=1500000", "timing.warmup_us=300000")
 STRAIGHT = "road.segments=[{kind: straight, length_m: 220}]"
-STRAIGHT_ON = np.zeros(2, np.float32)
+STRAIGHT_ON = np.zeros(2, dtype=np.float32)
 
 
 def finish(env, action=STRAIGHT_ON):
@@ -193,10 +193,12 @@ def test_wheel_and_pedals_do_what_they_say():
     env.reset(seed=0)
     assert isinstance(env._actions.controller, HeldCommand)
     before = env.observation.ego
-    env.step(np.array([0.5, 0.0], np.float32))
+    env.step(np.array([0.5, 0.0], dtype=np.float32))
     assert env.observation.ego.yaw_rate_radps > 0.0, "left is positive"
     assert env.observation.ego.speed_mps == pytest.approx(before.speed_mps)
-    speeds = [float(env.step(np.array([0.0, -1.0], np.float32))[0]["speed"][0]) for _ in range(3)]
+    speeds = [
+        float(env.step(np.array([0.0, -1.0], dtype=np.float32))[0]["speed"][0]) for _ in range(3)
+    ]
     assert speeds[0] > speeds[1] > speeds[2]
     plan = env._actions.plan(np.array([0.0, 1.0]), env.observation)
     assert plan.xy[-1, 0] > 2.0 * env.observation.ego.speed_mps, (
@@ -251,8 +253,8 @@ def test_environments_run_in_processes_and_agree_with_one_in_this_process():
     own, _ = one.reset(seed=5)
     assert_array_equal(seen["route"][1], own["route"])
     for _ in range(3):
-        seen, worth, *_ = several.step(np.array([[0.0, 0.2], [0.1, 0.0]], np.float32))
-        own, alone, *_ = one.step(np.array([0.1, 0.0], np.float32))
+        seen, worth, *_ = several.step(np.array([[0.0, 0.2], [0.1, 0.0]], dtype=np.float32))
+        own, alone, *_ = one.step(np.array([0.1, 0.0], dtype=np.float32))
     assert_array_equal(seen["route"][1], own["route"])
     assert worth[1] == pytest.approx(float(alone))
     several.close()
@@ -265,7 +267,7 @@ def test_a_brake_takes_effect_after_the_latency_of_the_scenario():
     env.reset(seed=0)
     speeds = [env.observation.ego.speed_mps]
     for _ in range(7):
-        env.step(np.array([0.0, -1.0], np.float32))
+        env.step(np.array([0.0, -1.0], dtype=np.float32))
         speeds.append(env.observation.ego.speed_mps)
     assert_allclose(speeds[1:6], speeds[0], atol=0.05)
     assert speeds[7] < speeds[0] - 0.5

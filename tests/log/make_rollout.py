@@ -111,7 +111,7 @@ def write_rollout(path, encoding="png"):
             plan = (
                 plan_at(step)
                 if step > 1
-                else Trajectory(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
+                else Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
             )
             log.driver_return(plan, [plan, plan_at(step)] if step > 2 else [])
             log.controller_request(state, plan, following.t_us, forced=step < 3)

@@ -20,7 +20,7 @@ def test_png_is_exact(rgb):
 
 @pytest.mark.parametrize("encoding", ["png", "jpeg"])
 def test_red_stays_red(encoding):
-    red = np.zeros((16, 16, 3), np.uint8)
+    red = np.zeros((16, 16, 3), dtype=np.uint8)
     red[..., 0] = 255
     back = decode_image(encode_image(red, encoding)).reshape(-1, 3).mean(axis=0)  # type: ignore[arg-type]
     assert_allclose(back, [255, 0, 0], atol=3)
@@ -35,9 +35,9 @@ def test_views_that_are_not_contiguous_are_encoded_as_seen():
     "bad",
     [
         np.zeros((4, 4, 3)),
-        np.zeros((4, 4), np.uint8),
-        np.zeros((4, 4, 4), np.uint8),
-        np.zeros((0, 4, 3), np.uint8),
+        np.zeros((4, 4), dtype=np.uint8),
+        np.zeros((4, 4, 4), dtype=np.uint8),
+        np.zeros((0, 4, 3), dtype=np.uint8),
     ],
 )
 def test_other_arrays_are_refused(bad):

@@ -61,9 +61,9 @@ def test_frames_may_come_from_a_generator(tmp_path):
     ("bad", "found"),
     [
         ([], "no frames"),
-        ([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 10, 3), np.uint8)], "frame 1: "),
-        ([np.zeros((8, 8, 3), np.float32)], "float32"),
-        ([np.zeros((8, 8), np.uint8)], "frame 0: "),
+        ([np.zeros((8, 8, 3), dtype=np.uint8), np.zeros((8, 10, 3), dtype=np.uint8)], "frame 1: "),
+        ([np.zeros((8, 8, 3), dtype=np.float32)], "float32"),
+        ([np.zeros((8, 8), dtype=np.uint8)], "frame 0: "),
     ],
 )
 def test_unusable_frames_are_refused_and_leave_no_file(tmp_path, bad, found):

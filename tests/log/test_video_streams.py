@@ -14,7 +14,7 @@ from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 
 def picture(value=120, height=32, width=48):
-    return np.full((height, width, 3), value, np.uint8)
+    return np.full((height, width, 3), value, dtype=np.uint8)
 
 
 def write(path, times, time_base, durations=None):
@@ -132,7 +132,7 @@ def sound_only(folder):
     with av.open(str(path), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
         frame = av.AudioFrame.from_ndarray(
-            np.zeros((1, 800), np.int16), format="s16", layout="mono"
+            np.zeros((1, 800), dtype=np.int16), format="s16", layout="mono"
         )
         frame.rate = 8000
         container.mux(stream.encode(frame))

@@ -339,7 +339,7 @@ def _written(folder, manifest, steps, plan):
 
 
 def _picture(renderer, k, width, height):
-    image = np.full((height, width, 3), (98, 96, 94), np.uint8)
+    image = np.full((height, width, 3), (98, 96, 94), dtype=np.uint8)
     horizon, middle, car = int(height * 0.45), width // 2, width // 14 + k * width // 60
     image[:horizon] = (230, 205, 175)
     for x in (0.0, 0.62, 1.3):

@@ -66,7 +66,7 @@ def ego_of(steps):
     x, y, yaw = (
         np.array([row["value"] for row in rows if row["metric"] == name]) for name in POSES
     )
-    t_us = np.array([row["t_us"] for row in rows if row["metric"] == POSES[0]], np.int64)
+    t_us = np.array([row["t_us"] for row in rows if row["metric"] == POSES[0]], dtype=np.int64)
     return Trajectory(t_us, np.column_stack([x, y, np.zeros_like(x)]), quat_from_yaw(yaw))
 
 
@@ -156,7 +156,7 @@ def road_users(content, t_us, count, salt):
 def picture(k):
     """Paint a frame that says which it is."""
     bits = [255 if k >> (BARS - 1 - bit) & 1 else 0 for bit in range(BARS)]
-    row = np.repeat(np.array(bits, np.uint8), CAMERA.width // BARS)
+    row = np.repeat(np.array(bits, dtype=np.uint8), CAMERA.width // BARS)
     return np.repeat(np.tile(row, (CAMERA.height, 1))[..., None], 3, axis=2)
 
 

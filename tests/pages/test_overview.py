@@ -195,7 +195,7 @@ def test_an_evaluator_declares_no_second_primary_question():
 
 
 def grey(value):
-    return encode_image(np.full((9, 16, 3), value, np.uint8), "jpeg", 95)
+    return encode_image(np.full((9, 16, 3), value, dtype=np.uint8), "jpeg", 95)
 
 
 def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, monkeypatch):
@@ -236,7 +236,7 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
     assert [shot.variant for shot in shots] == ["clean", "3dgs", "onefixer"]
     assert {(shot.scene, round(shot.t_s, 3)) for shot in shots} == {(scene, 2.8)}
     for shot in shots:
-        data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), np.uint8)
+        data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), dtype=np.uint8)
         upper, lower = np.split(cv2.imdecode(data, cv2.IMREAD_COLOR), 2)
         np.testing.assert_allclose((upper.mean(), lower.mean()), (150.0, 60.0), atol=3)
 

@@ -21,7 +21,7 @@ def scene(x, y, **more):
 def series_of(x, y, **more):
     names = {"ego_x_m": x, "ego_y_m": y, "ego_yaw_rad": 0.0 * np.asarray(x)} | more
     t_us = np.arange(len(x)) * 100_000
-    return {name: (t_us, np.array(values, float)) for name, values in names.items()}
+    return {name: (t_us, np.array(values, dtype=float)) for name, values in names.items()}
 
 
 def drawn(rollout, content, own):

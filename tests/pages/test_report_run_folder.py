@@ -24,7 +24,7 @@ def test_invalid_metric_is_none_even_where_a_number_stands(usual_run, tmp_path):
     shutil.copytree(usual_run, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
     table = pq.read_table(usual_run / "rollouts.parquet")
     zeros = pa.array(np.zeros(table.num_rows))
-    no = pa.array(np.zeros(table.num_rows, bool))
+    no = pa.array(np.zeros(table.num_rows, dtype=bool))
     table = table.set_column(table.column_names.index("offroad"), "offroad", zeros)
     table = table.set_column(table.column_names.index("offroad_valid"), "offroad_valid", no)
     pq.write_table(table, tmp_path / "run" / "rollouts.parquet")

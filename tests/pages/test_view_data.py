@@ -42,7 +42,7 @@ def documents(html):
 
 def number_of(jpeg):
     """Read which frame a picture is."""
-    grey = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_GRAYSCALE)
+    grey = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
     wide = grey.shape[1] // BARS
     return sum(
         1 << (BARS - 1 - bit)

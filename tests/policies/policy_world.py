@@ -118,7 +118,7 @@ def close_loop(
         plans.append(plan)
         ego = controller.advance(ego, to_world(plan, ego.T_world_rig), ego.t_us + 100_000)
     coordinates = [first.coordinates(e.T_world_rig[0, 3], e.T_world_rig[1, 3]) for e in seen]
-    s, offset = np.array(coordinates, np.float64).T
+    s, offset = np.array(coordinates, dtype=np.float64).T
     return Drive(s, offset, np.array([e.speed_mps for e in seen]), plans)
 
 

@@ -61,7 +61,7 @@ def test_mirrored_picture_mirrors_what_is_seen():
 
 
 def test_blank_picture_leaves_only_the_route_and_says_so():
-    blank = np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+    blank = np.full((CAMERA.height, CAMERA.width, 3), 90, dtype=np.uint8)
     curve = PaintedRoad(curvature_1pm=1 / 60)
     plan = look(policy(), blank, route_rig=route_of(curve, curve.pose(0.0)))
     assert plan.debug["mode"] == "route"
@@ -89,7 +89,7 @@ def test_lane_is_remembered_over_frames_without_paint():
         picture = (
             ROAD.image(CAMERA, pose, seed=k)
             if k < 12
-            else np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+            else np.full((CAMERA.height, CAMERA.width, 3), 90, dtype=np.uint8)
         )
         plan = one.act(observe(picture, EgoState(k * 100_000, pose, 8.0)))
         modes.append(plan.debug["mode"])
@@ -177,9 +177,9 @@ def test_frame_that_is_late_is_read_for_where_the_car_was_then():
 def test_missing_or_misshapen_frame_is_a_policy_error():
     one = policy()
     with pytest.raises(PolicyError, match=r"\(10, 10\)"):
-        one.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
+        one.act(observe(np.zeros((10, 10, 3), dtype=np.uint8), EgoState(0, np.eye(4), 5.0)))
     without = replace(
-        observe(np.zeros((144, 256, 3), np.uint8), EgoState(0, np.eye(4), 5.0)), frames={}
+        observe(np.zeros((144, 256, 3), dtype=np.uint8), EgoState(0, np.eye(4), 5.0)), frames={}
     )
     with pytest.raises(PolicyError, match="frames of \\[\\]"):
         one.act(without)

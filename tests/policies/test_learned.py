@@ -248,7 +248,7 @@ def test_frames_of_one_camera_reach_no_other_view(tmp_path):
 def test_wrong_frame_is_refused():
     policy = Learned(scenario_with())
     with pytest.raises(PolicyError, match=r"\(10, 10\)"):
-        policy.act(observe(np.zeros((10, 10, 3), np.uint8), EgoState(0, np.eye(4), 5.0)))
+        policy.act(observe(np.zeros((10, 10, 3), dtype=np.uint8), EgoState(0, np.eye(4), 5.0)))
 
 
 def test_command_says_nothing_about_the_place_in_the_lane():

@@ -49,7 +49,7 @@ def test_every_grid_cell_falls_where_a_plain_projection_puts_it(camera):
 
 
 def test_step_edge_is_no_paint_but_a_stroke_is():
-    value = np.full(GRID.inside.shape, 90, np.uint8)
+    value = np.full(GRID.inside.shape, 90, dtype=np.uint8)
     value[:, 200:] = 180
     assert RIDGES.response(value)[:, 150:250].max() == 0.0
     value[:] = 90
@@ -58,7 +58,7 @@ def test_step_edge_is_no_paint_but_a_stroke_is():
 
 
 def test_bars_of_a_crosswalk_are_not_taken_for_lines():
-    ground = np.full((*GRID.inside.shape, 3), 90, np.uint8)
+    ground = np.full((*GRID.inside.shape, 3), 90, dtype=np.uint8)
     for y in (1.75, -1.75):
         c = round(float(GRID.column_of(np.array(y))))
         ground[:, c - 1 : c + 2] = 220

@@ -34,7 +34,9 @@ def recorded_drive(folder, count=9, long_m=60.0):
     flat = np.tile([0.3, 0.3, 0.02], (n, 1))
     colours = dc_from_rgb(np.full((n, 3), 0.4))[:, None, :]
     cloud = GaussianCloud(means, np.tile([1.0, 0, 0, 0], (n, 1)), flat, np.full(n, 0.99), colours)
-    model = Reconstruction(cloud, {}, Sky(np.full((HEIGHT, WIDTH, 3), SKY_LEVEL / 255, np.float32)))
+    model = Reconstruction(
+        cloud, {}, Sky(np.full((HEIGHT, WIDTH, 3), SKY_LEVEL / 255, dtype=np.float32))
+    )
     model.save(folder / "model", {})
     scenario = with_camera(straight(actors=(parked("obstacle-001", 19.0, -1.8),)), WIDE, HIGH)
     shots = tuple(
@@ -51,7 +53,7 @@ def _photograph(scenario, folder, camera, i, aside_m):
     shift = np.eye(4)
     shift[1, 3] = aside_m
     picture = np.full(
-        (2 * HIGH, 2 * WIDE, 3), 122, np.uint8
+        (2 * HIGH, 2 * WIDE, 3), 122, dtype=np.uint8
     )  # the road, 0.4, in the photographs' exposure
     picture[:HIGH] = min(255, round(SKY_LEVEL * EXPOSURE))
     path = folder / f"{camera}-{i}.png"

@@ -31,7 +31,9 @@ def plain_draw_request(request, draw):
     share = np.broadcast_to(request.exposure.share, (spec.height, spec.width))
     shape = (spec.height, spec.width)
     out = RasterOutput(
-        np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, np.float32)
+        np.zeros((*shape, 3), dtype=np.float32),
+        np.ones(shape, dtype=np.float32),
+        np.zeros(shape, dtype=np.float32),
     )
     for time in np.unique(share[~np.isnan(share)]):
         T, actors = at_share(request, float(time))
@@ -53,7 +55,7 @@ def scenario():
 def draw(scenario):
     def drawn(views):
         outs = scene_of(scenario).render_all(views, 1)
-        return [out.covered(np.ones((1, 1), np.float32)) for out in outs]
+        return [out.covered(np.ones((1, 1), dtype=np.float32)) for out in outs]
 
     return drawn
 

@@ -35,7 +35,7 @@ from tests.renderers.recorded_drive import recorded_drive
 K = np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]])
 AHEAD = ahead()
 RIG = np.eye(4)
-GREY = np.full((60, 100, 3), 120, np.uint8)
+GREY = np.full((60, 100, 3), 120, dtype=np.uint8)
 
 
 def test_what_is_less_than_half_opaque_is_sky_in_a_wide_image():
@@ -46,7 +46,7 @@ def test_what_is_less_than_half_opaque_is_sky_in_a_wide_image():
 
 
 def depth_of_wall(distance_m):
-    return np.full((60, 100), distance_m, np.float32)
+    return np.full((60, 100), distance_m, dtype=np.float32)
 
 
 def depth_of_road():
@@ -81,7 +81,7 @@ class Flat:
     has_history = False
 
     def render(self, request):
-        return Frame(request.t_us, request.camera.name, np.zeros((16, 32, 3), np.uint8))
+        return Frame(request.t_us, request.camera.name, np.zeros((16, 32, 3), dtype=np.uint8))
 
     def facts(self):
         return {}
@@ -176,7 +176,7 @@ def test_wet_ground_is_darker_and_a_mirror_at_grazing_angles():
     assert (np.diff(wet) > 0).all()
     assert (wet[1:-1] < dry[1:-1]).all()
     assert wet_albedo(np.float32(0.2)) == pytest.approx(0.109, abs=0.002)  # by hand
-    steep, grazing = mirrored_share(np.array([1.0, 0.05], np.float32))
+    steep, grazing = mirrored_share(np.array([1.0, 0.05], dtype=np.float32))
     assert steep == 0
     assert 0.1 < grazing < 0.15
     road = shown(scene("rain=10"), depth_of_road())
@@ -333,7 +333,7 @@ def test_beams_start_at_the_ego_of_the_request_whatever_its_camera_is_called(nam
     monkeypatch.setattr(
         SceneLights,
         "lux",
-        lambda self, view, rig: rigs.append(rig) or np.zeros((60, 100), np.float32),
+        lambda self, view, rig: rigs.append(rig) or np.zeros((60, 100), dtype=np.float32),
     )
 
     class Wall:

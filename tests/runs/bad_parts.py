@@ -185,7 +185,9 @@ def _renderer(fault):
     class Bad:
         def render(self, request):
             shape = (request.camera.height, request.camera.width, 3)
-            return fault(Frame(request.t_us, request.camera.name, np.full(shape, 90, np.uint8)))
+            return fault(
+                Frame(request.t_us, request.camera.name, np.full(shape, 90, dtype=np.uint8))
+            )
 
     return Bad
 

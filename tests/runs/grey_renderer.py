@@ -16,7 +16,7 @@ class Grey:
 
     def render(self, request):
         shape = (request.camera.height, request.camera.width, 3)
-        return Frame(request.t_us, request.camera.name, np.full(shape, self.level, np.uint8))
+        return Frame(request.t_us, request.camera.name, np.full(shape, self.level, dtype=np.uint8))
 
 
 class Darker(Grey):

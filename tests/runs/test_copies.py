@@ -137,9 +137,9 @@ def test_a_flip_shows_all_cameras(watched):
 def test_a_film_has_the_times_of_its_frames_and_holds_those_of_a_slower_camera(tmp_path):
     film = Film()
     for t_us in (0, 200_000, 400_000):
-        film.add(Frame(t_us, "front", np.full((16, 16, 3), 200, np.uint8)))
+        film.add(Frame(t_us, "front", np.full((16, 16, 3), 200, dtype=np.uint8)))
     for t_us in (0, 400_000):
-        film.add(Frame(t_us, "left", np.full((8, 16, 3), 50 + t_us // 4000, np.uint8)))
+        film.add(Frame(t_us, "left", np.full((8, 16, 3), 50 + t_us // 4000, dtype=np.uint8)))
     film.save(tmp_path)
     shown = read_mp4(tmp_path / "front.mp4")
     assert shown.t_us.tolist() == [0, 200_000, 400_000]
@@ -153,8 +153,8 @@ def test_cameras_of_a_film_stand_in_the_order_of_their_first_frames_whatever_the
     for t_us, names in ((0, ("front", "left")), (200_000, ("left",)), (400_000, ("left", "front"))):
         for name in names:
             level = {"front": 200, "left": 50}[name]
-            film.add(Frame(t_us, name, np.full((16, 16, 3), level, np.uint8)))
-    film.add(Frame(600_000, "left", np.full((16, 16, 3), 50, np.uint8)))
+            film.add(Frame(t_us, name, np.full((16, 16, 3), level, dtype=np.uint8)))
+    film.add(Frame(600_000, "left", np.full((16, 16, 3), 50, dtype=np.uint8)))
     film.save(tmp_path)
     shown = read_mp4(tmp_path / "front.mp4")
     assert_allclose(shown.frames[:, 8, 8], [[200] * 3] * 4, atol=3)

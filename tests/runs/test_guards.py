@@ -19,7 +19,7 @@ from scenarios.load import load_scenario
 SCENE = load_scenario("smoke/straight")
 REQUEST = recorded_requests(SCENE, SCENE.start_us)[0]
 SHAPE = (REQUEST.camera.height, REQUEST.camera.width)
-GOOD = Frame(REQUEST.t_us, REQUEST.camera.name, np.full((*SHAPE, 3), 90, np.uint8))
+GOOD = Frame(REQUEST.t_us, REQUEST.camera.name, np.full((*SHAPE, 3), 90, dtype=np.uint8))
 
 
 class Returns(Renderer):
@@ -34,7 +34,7 @@ class Returns(Renderer):
 
 
 def plane(value):
-    return np.full(SHAPE, value, np.float32)
+    return np.full(SHAPE, value, dtype=np.float32)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ class Far(ConstantVelocity):
 def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure():
     with pytest.raises(PolicyError):
         run_rollout(SCENE, make_renderer("clean", SCENE), Far(SCENE))
-    times_us = np.array([0, 1], np.int64)
+    times_us = np.array([0, 1], dtype=np.int64)
     samples = (np.full((2, 3), 1e30),)
     assert plan_problem(Plan(0, times_us, np.zeros((2, 2)), np.zeros(2), samples=samples), 0)
 

@@ -172,7 +172,7 @@ def street(tmp_path_factory):
         pose = np.eye(4)
         pose[:3, :3] = RIG_FROM_CAMERA
         pose[0, 3] = 0.6 * i
-        cv2.imwrite(str(folder / f"images/{i:03d}.png"), np.full((32, 64, 3), i, np.uint8))
+        cv2.imwrite(str(folder / f"images/{i:03d}.png"), np.full((32, 64, 3), i, dtype=np.uint8))
         frames.append(
             {
                 "file_path": f"images/{i:03d}.png",

@@ -156,7 +156,7 @@ class WrongSize:
     """Gives frames of another size."""
 
     def render(self, request):
-        return Frame(request.t_us, request.camera.name, np.zeros((2, 2, 3), np.uint8))
+        return Frame(request.t_us, request.camera.name, np.zeros((2, 2, 3), dtype=np.uint8))
 
 
 class Breaks:
@@ -215,7 +215,7 @@ class Black:
         return Frame(
             request.t_us,
             request.camera.name,
-            np.zeros((request.camera.height, request.camera.width, 3), np.uint8),
+            np.zeros((request.camera.height, request.camera.width, 3), dtype=np.uint8),
         )
 
 

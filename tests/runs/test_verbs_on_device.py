@@ -45,7 +45,7 @@ def fork(folder, monkeypatch):
 def refine(folder, monkeypatch):
     with VideoWriter(folder / "in.mp4", Fraction(1, 10), Fraction(10)) as video:
         for i in range(FRAMES):
-            video.write(np.full((36, 64, 3), 30 * i, np.uint8), i)
+            video.write(np.full((36, 64, 3), 30 * i, dtype=np.uint8), i)
     files = [str(folder / "in.mp4"), "-o", str(folder / "out.mp4")]
     return ["refine", *files, "--fixer", "onefixer", "--anyway", "--device", "cuda"]
 

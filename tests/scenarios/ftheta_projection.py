@@ -67,7 +67,7 @@ def lens_of(values):
 
 
 def _polynomial(x, coefficients):
-    return np.asarray(np.polynomial.polynomial.polyval(x, coefficients), np.float64)
+    return np.asarray(np.polynomial.polynomial.polyval(x, coefficients), dtype=np.float64)
 
 
 def _fit(x, y):

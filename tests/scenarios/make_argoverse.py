@@ -127,7 +127,7 @@ def write_argoverse(folder, ego=None, annotations=None, document=None):
     (folder / "map" / "x___img_Sim2_city.json").write_text(
         json.dumps({"R": [1.0, 0.0, 0.0, 1.0], "t": shift, "s": 0.2})
     )
-    raster = np.full((40, 64), ORIGIN[2], np.float16)
+    raster = np.full((40, 64), ORIGIN[2], dtype=np.float16)
     raster[:5] = np.nan
     np.save(folder / "map" / "x_ground_height_surface____PIT.npy", raster)
     return folder

@@ -98,7 +98,7 @@ def decode_image(data: bytes, location: Path | str, do_this: str = GIVE, flag: i
 
     check_image(data, location, do_this)
     with parsing(location, do_this, "no readable image"):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flag)
     if image is None:
         raise InputError(f"{location}: {len(data)} bytes that do not decode", do_this)
     return image

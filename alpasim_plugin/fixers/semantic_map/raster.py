@@ -231,8 +231,8 @@ def draw_bands(cursor, lines, box_edges, shapes, stretch, image):
     """Draw bands of rows until none is left: lines, then shapes, then the edges of boxes."""
     height = image.shape[0]
     width = image.shape[1]
-    depth = np.empty(BAND * width * COUNT, np.float32)
-    colour = np.empty(BAND * width * COUNT, np.uint32)
+    depth = np.empty(BAND * width * COUNT, dtype=np.float32)
+    colour = np.empty(BAND * width * COUNT, dtype=np.uint32)
     while True:
         band_row = fetch_add(cursor, 0, 1) * BAND
         if band_row >= height:

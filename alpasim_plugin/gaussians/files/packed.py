@@ -280,7 +280,7 @@ def read_spz(path: Path | str) -> GaussianArrays:
         streams = []
         for i, need in enumerate(header.stream_bytes):
             if need == 0:
-                streams.append(np.zeros(0, np.uint8))
+                streams.append(np.zeros(0, dtype=np.uint8))
                 continue
             packed = struct.unpack_from("<Q", data, table + 16 * i)[0]
             plain = unzstd(
@@ -338,7 +338,7 @@ def in_ply_axes(arrays: GaussianArrays, system: str) -> GaussianArrays:
         arrays: Gaussians.
         system: Where their x, y and z point, such as ``RUB``: a letter of each pair of `DIRECTIONS`.
     """
-    M = np.array([DIRECTIONS[letter] for letter in system], np.float64).T
+    M = np.array([DIRECTIONS[letter] for letter in system], dtype=np.float64).T
     means, quats, sh = arrays.means, arrays.quats, arrays.sh
     if np.linalg.det(M) < 0:
         M = M * [-1, 1, 1]

@@ -195,7 +195,7 @@ def _header(count: int, properties: Sequence[str], comments: Sequence[str] = ())
 
 def write_points(path: Path, xyz: F64, rgb: U8) -> None:
     """Write points ``(N, 3)`` with colours ``(N, 3)`` as a binary PLY."""
-    rows = np.empty(len(xyz), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows = np.empty(len(xyz), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = xyz, rgb
     words = [*(f"float {name}" for name in "xyz"), *(f"uchar {name}" for name in COLOURS)]
     write_bytes(path, _header(len(rows), words) + rows.tobytes())
@@ -206,7 +206,7 @@ def ply_rows(cloud: GaussianCloud) -> NDArray[np.void]:
     n, k = cloud.sh.shape[:2]
     higher = np.swapaxes(np.asarray(cloud.sh)[:, 1:, :], 1, 2).reshape(n, 3 * (k - 1))
     with np.errstate(divide="ignore"):
-        log_scales = np.log(np.asarray(cloud.scales, np.float64))
+        log_scales = np.log(np.asarray(cloud.scales, dtype=np.float64))
     groups: list[tuple[Sequence[str], FloatArray]] = [
         (("x", "y", "z"), np.asarray(cloud.means)),
         (("nx", "ny", "nz"), np.zeros((n, 3))),
@@ -464,7 +464,7 @@ def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
             _EXPORT_AGAIN,
         )
     with open_regular(header.path) as stream:
-        return np.fromfile(stream, element.dtype, element.count, offset=element.offset)
+        return np.fromfile(stream, dtype=element.dtype, count=element.count, offset=element.offset)
 
 
 def _text_rows(
@@ -476,7 +476,7 @@ def _text_rows(
         raise InputError(f"{location}: {len(lines)} of {element.count} rows", _EXPORT_AGAIN)
     with parsing(location, _EXPORT_AGAIN, "rows that are not of numbers"):
         table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments=None)
-        rows = np.empty(element.count, dtype)
+        rows = np.empty(element.count, dtype=dtype)
         for name, column in zip(element.properties, table.T, strict=True):
             rows[name] = column
     return rows

@@ -187,7 +187,7 @@ def _harmonics(facts: dict[str, Any], plane: Callable[[str, int], U8], n: int) -
     count = int(facts["count"])
     bands = int(facts["bands"])
     coefficients = BANDS[bands]
-    codebook = np.array(facts["codebook"], np.float64)
+    codebook = np.array(facts["codebook"], dtype=np.float64)
     rows = -(-count // PALETTE_WIDTH)
     centroids = plane(facts["files"][0], rows * PALETTE_WIDTH * coefficients)[:, :3]
     palette = codebook[centroids].reshape(rows * PALETTE_WIDTH, coefficients, 3)

@@ -174,7 +174,7 @@ def tile_gradients(
         g_depth: float32 ``(H, W)``, gradient of the sum of weighted depths.
         pairs: float32 output, PAIR per entry of ``lists``, zero at the start.
     """
-    pixels = np.empty(16 * _BACK, np.float32)
+    pixels = np.empty(16 * _BACK, dtype=np.float32)
     while True:
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:

@@ -123,4 +123,4 @@ def background_image(background: Background, camera: PinholeCamera) -> F32:
             "give finite numbers, 0..1 for sRGB",
         )
     # Read-only arrays are another type to compiled code and would be compiled for again.
-    return np.require(value, np.float32, ["C_CONTIGUOUS", "WRITEABLE"])
+    return np.require(value, dtype=np.float32, requirements=["C_CONTIGUOUS", "WRITEABLE"])

@@ -304,7 +304,7 @@ def project_part(
         records: float32 output, RECORD per splat.
         ids: int64 output, one per splat.
     """
-    lanes = np.empty(RECORD * 16, np.float32)
+    lanes = np.empty(RECORD * 16, dtype=np.float32)
     groups = index.shape[0] // 16
     while True:
         first = v.fetch_add(cursor, part + 1, CHUNK)

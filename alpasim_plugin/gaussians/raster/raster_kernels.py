@@ -238,9 +238,9 @@ def composite_tiles(
         depth_sum: float32 output ``(H, W)``, sum of weighted depths, metres; with a background
             their mean, 0 where alpha is 0.
     """
-    state = np.empty(16 * STATE, np.float32)
-    near = np.empty(CHUNK * RECORD, np.float32)
-    masks = np.empty(CHUNK, np.int32)
+    state = np.empty(16 * STATE, dtype=np.float32)
+    near = np.empty(CHUNK * RECORD, dtype=np.float32)
+    masks = np.empty(CHUNK, dtype=np.int32)
     height, width = alpha.shape
     while True:
         tile = v.fetch_add(cursor, 0, 1)

@@ -132,7 +132,7 @@ def depth_order(depths: F32, ids: I64) -> I64:
     bits = depths.view(np.int32)
     keys = bits - bits.min(initial=np.iinfo(np.int32).max)
     pairs, has_ties = sorted_pairs(keys, int(keys.max(initial=0)).bit_length())
-    order = np.asarray(pairs & LOW_HALF, np.int64)
+    order = np.asarray(pairs & LOW_HALF, dtype=np.int64)
     if has_ties:
         is_like_next = np.diff(pairs >> 32) == 0
         tied = np.flatnonzero(np.r_[is_like_next, False] | np.r_[False, is_like_next])

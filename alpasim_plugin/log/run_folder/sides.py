@@ -138,17 +138,17 @@ class Side:
         cells = tuple(sorted(set(keys)))
         number = {cell: i for i, cell in enumerate(cells)}
         _, scene = np.unique([scene for _, scene, _ in cells], return_inverse=True)
-        cell = np.array([number[key] for key in keys], np.int64)
+        cell = np.array([number[key] for key in keys], dtype=np.int64)
         return cls(ok, cells, cell, scene, raw, reason, failure)
 
     @classmethod
     def of(cls, rollouts: Sequence[RolloutValues]) -> Side:
         """Lay out rollouts of one renderer."""
-        ok = np.array([rollout.ok for rollout in rollouts], bool)
+        ok = np.array([rollout.ok for rollout in rollouts], dtype=bool)
 
         def raw(metric: str) -> F64:
             values = [rollout.values.get(metric) for rollout in rollouts]
-            return np.where(ok, np.array(values, np.float64), np.nan)
+            return np.where(ok, np.array(values, dtype=np.float64), np.nan)
 
         return cls.laid_out(
             [rollout.cell for rollout in rollouts],
@@ -165,7 +165,7 @@ class Side:
         if other not in self._places:
             number = {cell: i for i, cell in enumerate(other.cells)}
             places = [number.get(cell, -1) for cell in self.cells]
-            self._places[other] = np.array(places, np.int64)
+            self._places[other] = np.array(places, dtype=np.int64)
         return self._places[other]
 
     @cached_property
@@ -250,7 +250,7 @@ class RolloutTable:
         self.n_rollouts = len(self._keys)
         self.renderers = list(dict.fromkeys(keys["renderer"]))
         self.policies = list(dict.fromkeys(keys["policy"]))
-        self._ok = np.array(keys["status"], object) == "ok"
+        self._ok = np.array(keys["status"], dtype=object) == "ok"
         self._failure_class = [None] * self.n_rollouts
         if "failure_class" in columns:
             self._failure_class = self._read(["failure_class"])[0].to_pylist()

@@ -62,7 +62,7 @@ READERS = {
         by(lambda p: pq.write_table(pa.table({"a": [1, 2]}), p), "v.parquet"),
         lambda path: read_parquet(path, {"a": "integer"}),
     ),
-    "a.safetensors": (lambda folder: save({"a": np.zeros(3, np.float32)}), read_metadata),
+    "a.safetensors": (lambda folder: save({"a": np.zeros(3, dtype=np.float32)}), read_metadata),
     "a.ply": (by(lambda p: write_ply(p, random_cloud(6, degree=1)), "v.ply"), read_gaussians),
     "a.splat": (by(lambda p: write_splat(p, random_cloud(6, degree=0)), "v.splat"), read_gaussians),
     "rollout.asl": (by(write_rollout, "v.asl"), read_asl),

@@ -33,7 +33,7 @@ class Grey:
 
     def render(self, request):
         shape = (request.camera.height, request.camera.width, 3)
-        return Frame(request.t_us, request.camera.name, np.full(shape, LEVEL, np.uint8))
+        return Frame(request.t_us, request.camera.name, np.full(shape, LEVEL, dtype=np.uint8))
 
 
 class Remote(Grey):
@@ -109,7 +109,7 @@ class Csv:
 
     def read(self, path, ego):
         data = path.read_bytes()
-        rows = np.array([line.split(",") for line in data.decode().split()], np.float64)
+        rows = np.array([line.split(",") for line in data.decode().split()], dtype=np.float64)
         xyz = np.column_stack([rows[:, 1:], np.zeros(len(rows))])
         drive = Trajectory(
             rows[:, 0].astype(np.int64), xyz, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))

@@ -91,7 +91,7 @@ def test_a_weight_of_depth_moves_gaussians_to_the_measured_depth(views):
     flat = replace(
         views[0],
         rgb=np.full_like(views[0].rgb, 128),
-        depth=np.full(views[0].rgb.shape[:2], 8.0, np.float32),
+        depth=np.full(views[0].rgb.shape[:2], 8.0, dtype=np.float32),
     )
     points = np.column_stack([np.full(400, 12.0), rng.uniform(-4, 4, 400), rng.uniform(0, 4, 400)])
     cloud = cloud_from_points(points, np.full((400, 3), 0.5))

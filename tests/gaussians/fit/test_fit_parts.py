@@ -237,7 +237,7 @@ def test_the_panorama_of_views_is_not_turned():
             se2(0, 0, yaw) @ ahead(),
         )
         rgb = np.rint(true.image(camera) * 255).astype(np.uint8)
-        views.append(PosedView(camera, rgb, sky=np.ones((180, 320), np.bool_)))
+        views.append(PosedView(camera, rgb, sky=np.ones((180, 320), dtype=np.bool_)))
     found = sky_of(views)
     off = [
         (found.image(view.camera) - true.image(view.camera))[10:-10, 10:-10, 0] for view in views

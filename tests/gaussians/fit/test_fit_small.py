@@ -111,7 +111,7 @@ def test_a_mask_keeps_what_it_hides_out_of_the_model(posed):
     spoiled = []
     for view in posed.views:
         rgb = view.rgb.copy()
-        mask = np.ones(view.rgb.shape[:2], bool)
+        mask = np.ones(view.rgb.shape[:2], dtype=bool)
         rgb[-8:], mask[-8:] = (255, 0, 255), False
         spoiled.append(replace(view, rgb=rgb, mask=mask))
     model = fit(spoiled, posed.start, replace(QUICK, steps=40)).graph()

@@ -32,7 +32,7 @@ def placed(views, tracks):
 
 
 def test_points_followed_through_the_street_lie_on_its_surfaces(tracks, placed):
-    good = np.ones(tracks.count, bool)
+    good = np.ones(tracks.count, dtype=bool)
     np.logical_and.at(good, tracks.point, placed.error_px < 0.5)
     good &= placed.angle_rad > 0.05
     xyz = placed.xyz[good]
@@ -45,7 +45,7 @@ def test_points_followed_through_the_street_lie_on_its_surfaces(tracks, placed):
 
 
 def test_masked_pixels_start_no_track(views):
-    mask = np.ones(views[0].rgb.shape[:2], bool)
+    mask = np.ones(views[0].rgb.shape[:2], dtype=bool)
     mask[64:] = False
     found = follow([replace(view, mask=mask) for view in views[:3]])
     assert found.count > 20
@@ -95,7 +95,7 @@ def test_depth_by_flow_is_the_street_s(views, tracks, placed):
 
 
 def test_nothing_is_measured_where_tracks_place_too_few_points(views):
-    none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+    none = Tracks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 0)
     empty = place(none, [view.camera for view in views])
     assert between_points(views[0].camera, none, empty, 0) is None
     assert not any(depth.any() for depth in depth_maps(views[:3], none, empty))

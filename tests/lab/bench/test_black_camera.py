@@ -60,7 +60,7 @@ def test_the_policy_is_handed_a_black_image_of_its_camera_alone(tmp_path, monkey
     )
     policy = BlackLeft(scenario, temperature=0.0)
     names = [sensor.camera for sensor in policy.sensors]
-    grey = np.full((4, 6, 3), 90, np.uint8)
+    grey = np.full((4, 6, 3), 90, dtype=np.uint8)
     state = EgoState(0, np.eye(4), 5.0)
     observation = Observation(
         0,

@@ -31,7 +31,7 @@ def drawn(camera, lines):
     """Draw lines along the road: (metres to the left, width, colour); the road is grey, the sky
     bright.
     """
-    picture = np.full((HEIGHT, WIDTH, 3), ROAD_LEVEL, np.uint8)
+    picture = np.full((HEIGHT, WIDTH, 3), ROAD_LEVEL, dtype=np.uint8)
     picture[:60] = 230
     for left, width, colour in lines:
         corners = [

@@ -36,7 +36,7 @@ class Truth(Renderer):
 
     def render(self, request):
         self.asked.append(request.t_us)
-        picture = np.full((request.camera.height, request.camera.width, 3), 122, np.uint8)
+        picture = np.full((request.camera.height, request.camera.width, 3), 122, dtype=np.uint8)
         picture[: request.camera.height // 2] = round(SKY_LEVEL * EXPOSURE)
         return Frame(request.t_us, request.camera.name, picture)
 

@@ -50,7 +50,9 @@ def test_pairs_become_a_bundle_with_its_card(pairs, tmp_path, capsys):
     fixer = make_fixer("onefixer", settings, scene_id="scene")
     assert fixer.trained
     assert fixer.label.startswith("onefixer, 2 updates, ")
-    assert fixer.step([Frame(0, "front", np.zeros((20, 30, 3), np.uint8))], ())[0].rgb.shape == (
+    assert fixer.step([Frame(0, "front", np.zeros((20, 30, 3), dtype=np.uint8))], ())[
+        0
+    ].rgb.shape == (
         20,
         30,
         3,

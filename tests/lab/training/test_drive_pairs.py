@@ -21,7 +21,7 @@ RECIPE = PhotographRecipe(width=64, every=3, steps=2, split="train")
 def drive(tmp_path):
     """Give a recorded drive along a road of points."""
     xyz = np.random.default_rng(0).uniform((2, -5, 0), (40, 5, 0.1), (400, 3))
-    write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, np.uint8))
+    write_points(tmp_path / "points.ply", xyz, np.full((400, 3), 100, dtype=np.uint8))
     return recorded_drive(tmp_path)
 
 
@@ -59,7 +59,7 @@ def test_each_photograph_is_held_out_once_and_the_others_are_its_recording(drive
 
 
 def test_too_few_photographs_are_refused(tmp_path):
-    write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+    write_points(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((1, 3), dtype=np.uint8))
     with pytest.raises(InputError):
         list(
             make_drive_pairs(

@@ -26,7 +26,7 @@ INDEX = np.arange(3)
 K = [[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]
 
 
-WALL = np.full((HEIGHT, WIDTH), 10, np.float16)
+WALL = np.full((HEIGHT, WIDTH), 10, dtype=np.float16)
 STANDS = Trajectory(np.array([0]), np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]))
 CAR = Actor("car", "car", Box(4, 2, 1.5), STANDS)
 

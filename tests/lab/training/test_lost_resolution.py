@@ -20,16 +20,18 @@ def test_a_draw_is_a_pure_function_of_its_stream_and_within_range():
 
 
 def test_flat_opaque_frames_stay_and_detail_is_lost():
-    lost = LostResolution(1.5, 3, np.full((48, 64), 0.5, np.float32), np.ones((48, 64), np.float32))
-    flat = np.full((2, 3, 48, 64), 0.25, np.float32)
+    lost = LostResolution(
+        1.5, 3, np.full((48, 64), 0.5, dtype=np.float32), np.ones((48, 64), dtype=np.float32)
+    )
+    flat = np.full((2, 3, 48, 64), 0.25, dtype=np.float32)
     assert_allclose(lost.apply(flat), flat, atol=1e-6)
     noise = np.random.default_rng(0).uniform(-1, 1, (2, 3, 48, 64)).astype(np.float32)
     assert lost.apply(noise).std() < 0.5 * noise.std()
 
 
 def test_black_shows_through_holes_by_their_transparency():
-    opacity = np.ones((48, 64), np.float32)
+    opacity = np.ones((48, 64), dtype=np.float32)
     opacity[10:20, 10:20] = 0.25
-    white = np.ones((1, 3, 48, 64), np.float32)
-    shown = LostResolution(0.6, 2, np.ones((48, 64), np.float32), opacity).apply(white)
+    white = np.ones((1, 3, 48, 64), dtype=np.float32)
+    shown = LostResolution(0.6, 2, np.ones((48, 64), dtype=np.float32), opacity).apply(white)
     assert_allclose((shown[0] + 1) / 2, np.broadcast_to(opacity, (3, 48, 64)), atol=1e-6)

@@ -25,7 +25,7 @@ from tests.lab.training.pair_files import make
 def pack(tmp_path):
     """Two sequences, the first with depths, in a file; the folder is gone."""
     folders = [make(tmp_path / "all", name=f"street_00{i}", frames=14).folder for i in (0, 1)]
-    depth = np.full((14, 32, 48), 8.0, np.float16)
+    depth = np.full((14, 32, 48), 8.0, dtype=np.float16)
     np.save(folders[0] / "depth.npy", depth)
     np.save(folders[0] / "boxes.npy", np.ones((1, 3)))
     path = tmp_path / "pairs.pack"
@@ -58,7 +58,7 @@ def test_sequences_come_back_nearly_as_they_were(pack, tmp_path):
 
 
 def test_depths_keep_their_logarithm_and_their_holes():
-    depth = np.array([0, 0.25, 1, 9, 120, 1000, 5000], np.float16)
+    depth = np.array([0, 0.25, 1, 9, 120, 1000, 5000], dtype=np.float16)
     found = depth_of_levels(levels_of_depth(depth)).astype(float)
     assert found[0] == 0
     assert np.abs(found[1:-1] / depth[1:-1].astype(float) - 1).max() < 0.02

@@ -56,9 +56,12 @@ def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_pat
     [
         (lambda f: (f / "sdmap.npy").unlink(), "sdmap.npy"),
         (lambda f: np.save(f / "rgb_gt.npy", np.zeros((3, 8, 8, 3))), "float64 with 4 axes"),
-        (lambda f: np.save(f / "rgb_input.npy", np.zeros((12, 8, 8, 3), np.uint8)), "rgb_input is"),
         (
-            lambda f: np.save(f / "t_us.npy", np.zeros(0, np.int64)),
+            lambda f: np.save(f / "rgb_input.npy", np.zeros((12, 8, 8, 3), dtype=np.uint8)),
+            "rgb_input is",
+        ),
+        (
+            lambda f: np.save(f / "t_us.npy", np.zeros(0, dtype=np.int64)),
             "no frame that every channel has",
         ),
         (lambda f: (f / "opacity.npy").write_bytes(b"\x93NUMPY\x01\x00"), "opacity.npy"),

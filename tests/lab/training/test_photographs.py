@@ -48,7 +48,7 @@ def write(
     bend = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2")])
     frames = []
     for i, x in enumerate(places):
-        image = np.zeros((int(lens["h"]), int(lens["w"]), 3), np.uint8)
+        image = np.zeros((int(lens["h"]), int(lens["w"]), 3), dtype=np.uint8)
         for u, v in cv2.projectPoints(dots - [x, 0, 0], np.zeros(3), np.zeros(3), K, bend)[
             0
         ].reshape(-1, 2):

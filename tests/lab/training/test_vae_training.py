@@ -38,7 +38,7 @@ def test_clip_larger_than_the_frames_is_refused(tmp_path):
     with pytest.raises(InputError):
         draw_pair_clip([make(tmp_path)], CropSize(5, 64, 64), 0, 0)
     with pytest.raises(InputError):
-        draw_video_clip([np.zeros((4, 32, 48, 3), np.uint8)], SIZE, 0, 0)
+        draw_video_clip([np.zeros((4, 32, 48, 3), dtype=np.uint8)], SIZE, 0, 0)
 
 
 def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path):

@@ -52,7 +52,7 @@ def test_damage_is_that_of_a_poor_reconstruction():
 
 
 def test_holes_are_where_opacity_is_low_and_show_what_is_behind():
-    bright = np.full((4, 48, 80, 3), 200, np.uint8)
+    bright = np.full((4, 48, 80, 3), 200, dtype=np.uint8)
     holed = SplatDamage(2.5, 0.75, 0.2, 0.0, 0.0, 0.25, 0, 60.0, 0.0)
     for seed in range(12):
         images, opacity = damaged(bright, holed, seed)

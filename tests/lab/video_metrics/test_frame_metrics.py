@@ -13,8 +13,8 @@ TRUTH = RNG.integers(0, 256, (3, 20, 27, 3)).astype(np.uint8)
 
 
 def test_ssim_of_black_against_white_and_of_flat_frames():
-    black = np.zeros((1, 16, 16, 3), np.uint8)
-    white = np.full((1, 16, 16, 3), 255, np.uint8)
+    black = np.zeros((1, 16, 16, 3), dtype=np.uint8)
+    white = np.full((1, 16, 16, 3), 255, dtype=np.uint8)
     assert ssim(black, white)[0] < 1e-3
     assert ssim(black, black)[0] == pytest.approx(1.0, abs=1e-6)
 
@@ -29,7 +29,7 @@ def test_psnr_of_a_known_error_and_of_identical_frames():
 
 @pytest.mark.parametrize(("low", "peak"), [(0, 255.0), (0, 1.0), (-1, 2.0)])
 def test_the_range_of_values_does_not_change_psnr(low, peak):
-    a = np.full((2, 2, 3), low, np.float32)
+    a = np.full((2, 2, 3), low, dtype=np.float32)
     assert image_metrics.psnr_db(a, a + np.float32(peak / 255), peak) == pytest.approx(
         20 * np.log10(255), abs=1e-4
     )
