@@ -13,7 +13,8 @@ import pytest
 from alpasim_plugin.core.geometry import interpolate, inverse, se2, trajectory_from_poses
 from alpasim_plugin.drives import build, quality
 from alpasim_plugin.drives.build import import_drive
-from alpasim_plugin.drives.points import moved_rig
+from alpasim_plugin.drives.held_out import EVERY
+from alpasim_plugin.drives.points import moved_rig, with_corrected_poses
 from alpasim_plugin.drives.source import SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.drive import fit_drive
@@ -23,15 +24,13 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
-from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from alpasim_plugin.gaussians.scene import sky
 from scenarios.load import load_scenario
-from tests.drives.street import K, Street, write_kitti
+from tests.drives.street import HEIGHT, STEP_M, WIDTH, K, Street, write_kitti
 
 SHORT = replace(SplatRecipe.street(), steps=2, points=1500, densify_every=0, save_every=2)
 # What a scenario drives in and is measured by; the photographs themselves differ.
 SHAPED = ("model/background.ply", "model/sky.png", "points.ply", "transforms.json")
-
-pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -45,6 +44,7 @@ def held_out_files(folder):
     return [one.path.rsplit("/", 1)[1] for one in scenario.recording if one.use == "held-out"]
 
 
+@pytest.mark.slow
 def test_other_pixels_in_a_held_out_photograph_leave_the_import_equal_bit_for_bit(
     short_fit, tmp_path
 ):
@@ -60,6 +60,92 @@ def test_other_pixels_in_a_held_out_photograph_leave_the_import_equal_bit_for_bi
     for file in SHAPED:
         before = (tmp_path / "before" / file).read_bytes()
         assert (tmp_path / "after" / file).read_bytes() == before, file
+
+
+class PastPixelsError(Exception):
+    """Ends an import before its fit."""
+
+
+def what_a_fit_reads(drive, monkeypatch, folder):
+    """Return the names of the photographs that the fit of a drive is given, and the bytes of all
+    that it reads of them.
+    """
+    parts = []
+    names = []
+
+    def read(views, points, *, kept, **rest):
+        names.extend(view.name for view in views)
+        for view in views:
+            parts.extend((view.rgb, view.camera.K, view.camera.T_camera_world))
+        parts.extend((points.means, points.sh, points.scales))
+        for camera in kept.values():  # cameras alone, without pixels
+            parts.extend((camera.K, camera.T_camera_world))
+        raise PastPixelsError
+
+    monkeypatch.setattr(build, "fit_drive", read)
+    with pytest.raises(PastPixelsError):
+        build._built(drive, folder, folder / "work", "", None, None, lambda *stage: None, "cpu")
+    return names, b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+
+
+def street_drive(count=9, unlike=(), shaken_m=0.03):
+    """Return a drive of a front camera along the street, and of a side camera that takes its
+    photographs 12 ms later and whose pixels nobody looks at; poses are off, those of a rig together.
+
+    Args:
+        count: Photographs of the front camera.
+        unlike: Numbers of photographs that show something else.
+        shaken_m: How far the rig's poses are off.
+    """
+    street = Street(bow_m=0.0)
+    lens = Lens(WIDTH, HEIGHT, K)
+    blank = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    looks_left = se2(0, 0, np.pi / 2)[:3, :3]
+    photographs = []
+    for camera, late_us in (("front", 0), ("left", 12_000)):
+        for i in range(count):
+            t_us = 60_000 * i + late_us
+            T = street.pose(STEP_M * t_us / 60_000)
+            image = blank
+            if camera == "front":
+                image = street.photograph(T)[::-1, ::-1] if i in unlike else street.photograph(T)
+            else:
+                T[:3, :3] = looks_left @ T[:3, :3]
+            T[1:3, 3] += shaken_m * np.array([np.sin(t_us * 1e-5), np.cos(t_us * 8e-6)])
+            data = memoryview(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
+            place = f"{camera}, {i}"
+            file = Path(f"{camera}/{i:06d}.png")
+            photographs.append(PosedPhotograph(file, lens, T, place, t_us, camera, {}, data))
+    return SourceDrive("transforms", "rig", tuple(photographs), "front", ("left",), "metres")
+
+
+def test_other_pixels_in_a_held_out_photograph_change_nothing_that_a_fit_reads(
+    monkeypatch, tmp_path
+):
+    names, before = what_a_fit_reads(street_drive(), monkeypatch, tmp_path / "before")
+    assert names == [f"front-{i:06d}" for i in range(9) if i != 4]
+    _, after = what_a_fit_reads(street_drive(unlike=[4]), monkeypatch, tmp_path / "after")
+    assert after == before
+
+
+def test_poses_that_photographs_correct_stay_those_of_one_rig():
+    drive = street_drive()
+    moved = with_corrected_poses(drive, EVERY)
+    assert "poses were corrected" in str(moved.notes)
+    front_us = [one.t_us for one in moved.of("front")]
+    rig = trajectory_from_poses(front_us, [one.T_world_camera for one in moved.of("front")])
+    places = np.array(
+        [
+            (inverse(interpolate(rig, one.t_us)) @ one.T_world_camera)[:3, 3]
+            for one in moved.of("left")[:-1]
+        ]
+    )
+    shifts = [
+        np.linalg.norm(new.T_world_camera[:3, 3] - old.T_world_camera[:3, 3])
+        for old, new in zip(drive.of("left"), moved.of("left"), strict=True)
+    ]
+    assert np.max(shifts) > 0.02
+    assert np.linalg.norm(places, axis=1).max() < 0.005
 
 
 def rig_drive(front_us, side_us, side_m=(0.4, 0.6, 0.0)):
@@ -136,7 +222,7 @@ def test_a_held_out_photograph_is_compared_in_the_exposure_of_its_own_camera(mon
     empty = Reconstruction(
         cloud_from_points(np.zeros((3, 3)), np.zeros((3, 3))),
         {},
-        Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)),
+        sky.Sky(np.zeros((sky.HEIGHT, sky.WIDTH, 3), dtype=np.float32)),
     )
     views = {"fitted": fitted, "held-out": held, "never-fitted": []}
     quality.measure(empty, views, exposures, lambda stage, done, total: None)
@@ -164,7 +250,7 @@ def test_coverage_is_measured_beside_the_path_whatever_way_a_camera_looks(monkey
     empty = Reconstruction(
         cloud_from_points(np.zeros((3, 3)), np.zeros((3, 3))),
         {},
-        Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)),
+        sky.Sky(np.zeros((sky.HEIGHT, sky.WIDTH, 3), dtype=np.float32)),
     )
     quality.measure(
         empty, {"fitted": views, "held-out": [], "never-fitted": []}, {}, lambda *stage: None

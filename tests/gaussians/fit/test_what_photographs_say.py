@@ -9,11 +9,16 @@ import pytest
 
 from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.fit import drive
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_near
+from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
+from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
-from alpasim_plugin.gaussians.fit.views import halved
-from tests.gaussians.fit.street_views import brightened, street_views, true_depth, turned
+from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
+from tests.drives.street import STEP_M, K
+from tests.gaussians.fit.street_views import STREET, brightened, street_views, true_depth, turned
 
 
 @pytest.fixture(scope="module")
@@ -169,6 +174,34 @@ def test_a_gain_between_photographs_is_that_of_the_nearest_two_of_the_own_camera
     assert np.allclose(gain_at("left", 8.0), 0.5)
     assert np.allclose(gain_at("roof", 9.0, 3), 5.0, atol=2e-3)
     assert np.allclose(gain_at("front", 0.0, 0), 1.0)
+
+
+def test_a_held_out_photograph_has_the_gain_of_its_own_camera_s_neighbours(monkeypatch):
+    """The left camera stands beside the front one, and meters half as bright."""
+    gains = {"front": (1.0,) * 3, "left": (0.5,) * 3}
+    rng = np.random.default_rng(0)
+    cameras = {}
+    views = []
+    for camera, left_m in (("front", 0.0), ("left", 0.1)):
+        for i in range(4):
+            T = STREET.pose(STEP_M * i, -left_m)
+            name = f"{camera}-{i:06d}"
+            cameras[name] = PinholeCamera.from_pose(32, 16, K, T)
+            rgb = rng.integers(0, 255, (16, 32, 3), dtype=np.uint8)
+            views.append(PosedView(cameras[name], rgb, name))
+
+    def fitted(views, start, recipe, **rest):
+        empty = Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32))
+        model_gains = tuple(gains[view.camera_name] for view in views)
+        return Reconstruction(start.background, {}, empty, model_gains)
+
+    monkeypatch.setattr(drive, "fit", fitted)
+    kept = {name: cameras[name] for name in ("front-000001", "left-000002")}
+    train = [view for view in views if view.name not in kept]
+    points = cloud_from_points(np.zeros((5, 3)), np.full((5, 3), 0.5))
+    exposures = drive.fit_drive(train, points, kept=kept).exposures
+    assert exposures["front-000001"] == pytest.approx(gains["front"])
+    assert exposures["left-000002"] == pytest.approx(gains["left"])
 
 
 def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views):
