@@ -15,7 +15,7 @@ from alpasim_plugin.drives.opening import read_source
 from scenarios.load import load_scenario
 from tests.drives.opened_drives import assert_is_the_street, opened
 from tests.drives.py123d_log import ORIGIN, TYPES, write_py123d
-from tests.drives.street import COUNT
+from tests.drives.street import COUNT, K
 from tests.examples import first_of
 
 
@@ -28,6 +28,8 @@ def test_a_log_is_the_street_with_its_vehicle_and_the_car_that_moves(log):
     drive, placed = opened(log)
     assert (drive.kind, drive.scene_id, drive.front) == ("py123d", "street-1", "pcam_f0")
     assert_is_the_street(placed)
+    # The log counts pixels from the middle of the first one.
+    assert np.allclose(drive.photographs[0].lens.K, K)
     assert placed.mounts["pcam_f0"][:2, 3] == pytest.approx([1.2, 0.1])
     assert (drive.vehicle.box.length_m, drive.vehicle.rear_axle_to_centre_m) == (5.0, 1.5)
     (car,) = placed.actors

@@ -5,8 +5,8 @@ import pytest
 import shapely
 from numpy.testing import assert_allclose, assert_array_equal
 
-from alpasim_plugin.core.geometry import yaw_from_quat
-from scenarios.argoverse import read_argoverse
+from alpasim_plugin.core.geometry import inverse, yaw_from_quat
+from scenarios.argoverse import read_argoverse, read_calibration
 from tests.scenarios.make_argoverse import (
     CAR,
     ORIGIN,
@@ -20,6 +20,7 @@ from tests.scenarios.make_argoverse import (
     poses,
     vector_map,
     write_argoverse,
+    write_feather,
 )
 
 
@@ -142,6 +143,25 @@ def test_cuboids_turn_with_the_ego(tmp_path):
     actor = read_argoverse(write_argoverse(tmp_path / "x", ego=ego, annotations=rows)).actors[0]
     assert_allclose(actor.track.xyz[0], [3.0 - 2.0, 7.0, 1.33], atol=1e-8)
     assert yaw_from_quat(actor.track.quat[0]) == pytest.approx(np.pi / 2)
+
+
+def test_a_camera_of_a_log_sees_a_point_where_its_files_say(tmp_path):
+    """The files count pixels from the middle of the first one, and heights from the rear axle."""
+    inner = {"sensor_name": ["left"], "fx_px": [400.0], "fy_px": [300.0], "k1": [0.0]}
+    inner |= {"k2": [0.0], "k3": [0.0], "cx_px": [99.5], "cy_px": [49.5]}
+    inner |= {"width_px": [200.0], "height_px": [100.0]}
+    half = np.radians(-90) / 2  # about the ego's x: the camera looks to its left
+    outer = {"sensor_name": ["left"], "qw": [np.cos(half)], "qx": [np.sin(half)], "qy": [0.0]}
+    outer |= {"qz": [0.0], "tx_m": [1.5], "ty_m": [0.2], "tz_m": [1.4]}
+    (tmp_path / "calibration").mkdir()
+    write_feather(tmp_path / "calibration/intrinsics.feather", inner)
+    write_feather(tmp_path / "calibration/egovehicle_SE3_sensor.feather", outer)
+    (camera,) = read_calibration(tmp_path)
+    above_ground_m = 0.33 + 1.4
+    points_rig = [[1.5, 8.2, above_ground_m, 1.0], [3.5, 8.2, above_ground_m - 1.0, 1.0]]
+    local = (inverse(camera.T_rig_camera) @ np.transpose(points_rig))[:3]
+    pixels = camera.K @ local / local[2]
+    assert_allclose(pixels[:2].T, [[100.0, 50.0], [200.0, 87.5]])
 
 
 def test_rows_of_the_ego_are_no_actor(tmp_path):
