@@ -23,7 +23,6 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, CameraSpec, LensModel
 from scenarios.recorded import SourceFiles
 from scenarios.usdz_archive import Archive
-from scenarios.usdz_fields import USDZ, met_in_sensor
 
 FRONT_WIDE = "camera_front_wide_120fov"
 # Rendered size; the recorded frames are 1920 x 1080.
@@ -32,12 +31,21 @@ HEIGHT = 288
 HORIZONTAL_FOV_RAD = np.pi / 2
 
 TABLES = tuple(f"{folder}/calibration_estimate.parquet" for folder in ("clipgt", "map_data"))
+MOUNTS = ("nominalSensor2Rig_FLU", "correction_sensor_R_FLU")
 LENS = Fields(
-    "f-theta lens",
-    read={"properties": USDZ.read["properties"]},
-    harmless={},
+    "f-theta camera",
+    read={
+        "sensor": f"name properties {' '.join(MOUNTS)} correction_rig_T",
+        "properties": """Model cx cy width height polynomial polynomial-type linear-c linear-d
+            linear-e""",
+        **dict.fromkeys(MOUNTS, "roll-pitch-yaw"),
+        MOUNTS[0]: "roll-pitch-yaw t",
+    },
+    harmless={"sensor": "car-mask parameter protocol"},
     others="refused",
 )
+# Whether a polynomial of this type goes from pixels to the angle.
+GOES_BACK = {"pixeldistance-to-angle": True, "angle-to-pixeldistance": False}
 GIVE = "give an f-theta calibration"
 DEGREE = 5  # of the polynomial, as in the calibrations of AlpaSim's scenes
 
@@ -70,7 +78,8 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
     """Return the f-theta cameras of a scene as they were calibrated.
 
     Raises:
-        InputError: The scene has no calibration, or it is damaged.
+        InputError: The scene has no calibration, it is damaged, or a camera has fields that are
+            not read.
     """
     with Archive(SourceFiles(), path) as archive:
         sensors = _sensors(archive)
@@ -78,8 +87,7 @@ def rig_cameras(path: Path) -> tuple[CameraSpec, ...]:
     for name, sensor in sensors.items():
         if not (sensor.get("properties") or {}).get("Model"):
             continue  # a radar or a lidar
-        met = met_in("properties", sensor["properties"])
-        LENS.check(met, f"{path}, {name}", "leave out what the lens does not need")
+        check_fields(sensor, f"{path}, {name}")
         with parsing(f"{path}, {name}", GIVE):
             cx, cy, width, height = _lens_numbers(sensor["properties"])[0]
             lens = sensor_lens(sensor["properties"])
@@ -107,20 +115,32 @@ def front_wide(archive: Archive) -> tuple[tuple[CameraSpec, ...], tuple[str, ...
     """Return the front wide camera where the scene holds its calibration, with notes.
 
     Raises:
-        InputError: The table is there, but damaged or its front wide camera is not an f-theta
-            camera.
+        InputError: The table is there, but damaged, or its front wide camera is not an f-theta
+            camera or has fields that are not read.
     """
     sensor = _sensors(archive).get(FRONT_WIDE)
     if sensor is None:
         return (), (
             f"no calibration of {FRONT_WIDE} in this scene: the default front camera is used",
         )
+    check_fields(sensor, f"{archive.path}, {FRONT_WIDE}")
     with parsing(f"{archive.path}, {FRONT_WIDE}", GIVE):
-        archive.files.met += met_in_sensor(sensor)
         camera = front_camera(np.array(_lens_numbers(sensor["properties"])[0]), mount(sensor))
     return (camera,), (
         "rendered through a pinhole of 90 degrees width inside the calibrated 120 degree f-theta lens",
     )
+
+
+def check_fields(sensor: JsonObject, location: str) -> None:
+    """Refuse a calibrated camera that has fields which are not read: each may bend or move it.
+
+    Raises:
+        InputError: Names them.
+    """
+    met = met_in("sensor", sensor)
+    for holder in ("properties", *MOUNTS):
+        met += met_in(holder, sensor.get(holder) or ())
+    LENS.check(met, location, "leave out what the camera does not need")
 
 
 def _lens_numbers(properties: JsonObject) -> tuple[list[float], list[float], bool]:
@@ -133,8 +153,10 @@ def _lens_numbers(properties: JsonObject) -> tuple[list[float], list[float], boo
     if not 1 <= len(polynomial) <= DEGREE + 1:
         raise ValueError(f"a polynomial of {len(polynomial)} coefficients")
     size = [float(properties[name]) for name in ("cx", "cy", "width", "height")]
-    back = "pixeldistance-to-angle"
-    return size, polynomial, properties.get("polynomial-type", back) == back
+    kind = properties.get("polynomial-type", next(iter(GOES_BACK)))
+    if kind not in GOES_BACK:
+        raise ValueError(f"a polynomial of type {kind!r}, only {' or '.join(GOES_BACK)} are read")
+    return size, polynomial, GOES_BACK[kind]
 
 
 def sensor_lens(properties: JsonObject) -> LensModel:

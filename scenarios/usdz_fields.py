@@ -30,12 +30,6 @@ USDZ = Fields(
         "traffic_sign": "center",
         "wait_line": "location is_implicit",
         "calibration_estimate": "rig_json",
-        "sensor": """name properties nominalSensor2Rig_FLU correction_sensor_R_FLU
-            correction_rig_T""",
-        "nominalSensor2Rig_FLU": "roll-pitch-yaw t",
-        "correction_sensor_R_FLU": "roll-pitch-yaw",
-        "properties": """Model cx cy width height polynomial polynomial-type linear-c linear-d
-            linear-e""",
     },
     # What the scene was made of, and the weights of a renderer, which a note names.
     harmless={
@@ -73,10 +67,3 @@ def met_in_sequence(sequence: JsonObject) -> Iterator[str]:
     yield from met_in("sequence", sequence)
     for holder in ("tracks_data", "cuboidtracks_data"):
         yield from met_in(holder, sequence[holder])
-
-
-def met_in_sensor(sensor: JsonObject) -> Iterator[str]:
-    """Yield the names of the fields of a calibrated camera."""
-    yield from met_in("sensor", sensor)
-    for holder in ("properties", "nominalSensor2Rig_FLU", "correction_sensor_R_FLU"):
-        yield from met_in(holder, sensor.get(holder) or ())

@@ -13,6 +13,7 @@ from typing_extensions import TypedDict
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_json_object
+from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.files.reading import as_shape
 from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.core.json_types import JsonObject
@@ -24,6 +25,16 @@ COEFFICIENTS = {
     "opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
+RIG = Fields(
+    "transforms.json of a rig",
+    read={
+        "frame": f"""frames camera camera_model axes w h fl_x fl_y cx cy transform_matrix
+            {" ".join(COEFFICIENTS["opencv"])}"""
+    },
+    # A focal length is stated beside an angle, and no photograph is read.
+    harmless={"frame": "aabb_scale camera_angle_x camera_angle_y file_path"},
+    others="refused",
+)
 ROTATION_ERROR = 1e-3
 
 
@@ -46,13 +57,16 @@ def read_transforms(path: Path) -> tuple[CameraSpec, ...]:
     """Read the cameras of a calibration.
 
     Raises:
-        InputError: A key is missing or cannot be, or a camera has two frames.
+        InputError: A key is missing, cannot be or is not read, or a camera has two frames.
     """
     document = read_json_object(path, do_this=DO_THIS)
     frames = as_shape(list[JsonObject], document.get("frames"), f"{path}, frames", DO_THIS)
     cameras: dict[str, CameraSpec] = {}
     for i, frame in enumerate(frames):
-        camera = _camera({**document, **frame}, f"{path}, frame {i}")
+        together = {**document, **frame}
+        met = met_in("frame", (key for key, value in together.items() if value))
+        RIG.check(met, f"{path}, frame {i}", "write the rig without these keys")
+        camera = _camera(together, f"{path}, frame {i}")
         if camera.name in cameras:
             raise InputError(
                 f"{path}, frame {i}: a second frame of camera {camera.name!r}",
@@ -67,6 +81,13 @@ def _camera(document: JsonObject, location: str) -> CameraSpec:
     kind: Literal["opencv", "fisheye"] = (
         "fisheye" if frame.get("camera_model") == "OPENCV_FISHEYE" else "opencv"
     )
+    others = set(COEFFICIENTS["opencv"]) - set(COEFFICIENTS[kind])
+    lacking = sorted(key for key in others if document.get(key))
+    if lacking:
+        raise InputError(
+            f"{location}: {', '.join(lacking)}, which a {kind} lens does not have",
+            "name the lens that has them by camera_model",
+        )
     coefficients = [document.get(key, 0.0) for key in COEFFICIENTS[kind]]
     bent = tuple(as_shape(list[float], coefficients, f"{location}, coefficients", DO_THIS))
     pose = frame["transform_matrix"]

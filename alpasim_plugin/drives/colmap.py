@@ -449,17 +449,16 @@ def _image(reader: _Binary | _Words) -> _Image:
     reader.skip(24)  # points: x, y and a number
     length = np.linalg.norm(pose[:4])
     if not np.isfinite(pose).all() or abs(length - 1) > UNIT:
-        raise InputError(
-            f"image {name}: its pose is not finite or no rotation",
-            "give unit quaternions and finite shifts",
-        )
+        raise ValueError(f"image {name}: its pose {pose} is not finite or no rotation")
     return _Image(number, name, camera, inverse(se3(pose[4:], np.array(pose[:4]) / length)))
 
 
 def _point(reader: _Binary | _Words) -> tuple[float, ...]:
-    values = reader.take("QdddBBBd")
+    number, *values, _error = reader.take("QdddBBBd")
     reader.skip(8)  # the images that show it
-    return values[1:7]
+    if not np.isfinite(values[:3]).all():
+        raise ValueError(f"point {number}: its position {values[:3]} is not finite")
+    return tuple(values)
 
 
 def _rig(reader: _Binary | _Words) -> tuple[int, dict[int, F64 | None]]:

@@ -15,6 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.limits import BODY_M
 from alpasim_plugin.core.types import Actor, Box, LoggedImage, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.asl import AslReader
+from alpasim_plugin.log.fields import ASL, take_newer_fields
 from alpasim_plugin.log.schema import (
     EGO,
     increasing_times,
@@ -39,6 +40,7 @@ class _Collected:
     route: egodriver_pb2.Route = field(default_factory=egodriver_pb2.Route)
     static_ids: set[str] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
+    newer: list[str] = field(default_factory=list)
     info: dict[str, Any] = field(
         default_factory=lambda: {
             "empty_plans": 0,
@@ -58,7 +60,8 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         images: Keep the encoded camera images; False saves their memory.
 
     Returns:
-        The rollout. ``warnings`` lists a truncated last entry and entries of unknown kind; ``info``
+        The rollout. ``warnings`` lists a truncated last entry and fields, kinds of entries among
+        them, of a newer version of the format; ``info``
         holds ``entries`` (count by kind), ``n_steps``, ``empty_plans`` and ``unanswered`` (drive
         requests without a plan), ``terminated`` (the driver ended the rollout), ``cameras``
         (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``,
@@ -78,6 +81,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
             raise _bad(
                 path, f"first entry is {kind}", "give a whole log: rollout_metadata comes first"
             )
+        got.newer += take_newer_fields(entry)
         _collect(got, kind, entry)
         if kind == "driver_camera_image" and images:
             image = entry.driver_camera_image.camera_image
@@ -87,10 +91,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
                 )
             )
     warnings = [reader.truncated] if reader.truncated else []
-    if got.counts["unknown"]:
-        warnings.append(
-            f"{path}: {got.counts['unknown']} entries of a kind that this version does not know were skipped"
-        )
+    warnings += [f"{path}: {note}" for note in ASL.notes(got.newer)]
     return _assemble(got, tuple(warnings))
 
 

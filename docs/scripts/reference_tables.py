@@ -20,6 +20,7 @@ from pages import DOCS, replaced, table, write
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from alpasim_plugin.cameras.transforms import RIG
 from alpasim_plugin.cli.main import PANELS, load_verb
 from alpasim_plugin.control.can_codec import DBC
 from alpasim_plugin.core.metric_types import MetricInfo
@@ -31,6 +32,7 @@ from alpasim_plugin.gaussians.files.packed import COMPRESSED, SPZ
 from alpasim_plugin.gaussians.files.ply import PLY
 from alpasim_plugin.gaussians.files.sog import SOG
 from alpasim_plugin.gaussians.fit.photographs import TRANSFORMS
+from alpasim_plugin.log.fields import ASL
 from alpasim_plugin.log.run_folder.records import Manifest, RunInfo
 from evaluators.metrics.score_table import BENCHMARKS
 from evaluators.metrics.table import METRICS
@@ -45,6 +47,10 @@ from scenarios.schema import models
 from scenarios.schema_parts import Part
 from scenarios.usdz_fields import USDZ
 
+FORMATS = (
+    *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, RIG, TRAINED_FRAME, COLMAP, KITTI, PY123D),
+    *(ARGOVERSE, CALIBRATION, USDZ, LENS, OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC, ASL),
+)
 EVERY_VERB = ("--json", "--debug", "--help")
 TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
@@ -167,12 +173,8 @@ def key_tables() -> str:
 
 def field_table() -> str:
     """Return the table of the fields that readers know."""
-    formats = (
-        *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, TRAINED_FRAME, COLMAP, KITTI, PY123D),
-        *(ARGOVERSE, CALIBRATION, USDZ, LENS, OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC),
-    )
     head = ("form", "read", "left out without a change", "refused")
-    return table(head, [fields.row() for fields in formats])
+    return table(head, [fields.row() for fields in FORMATS])
 
 
 def documented(record: type[Any]) -> dict[str, str]:

@@ -518,6 +518,28 @@ def test_numbers_behind_the_last_one_of_a_line_of_colmap_are_refused(tmp_path):
         read_source(tmp_path, need_files=False)
 
 
+@pytest.mark.parametrize("number", ["nan", "inf"])
+@pytest.mark.parametrize(
+    ("file", "record", "column", "place"),
+    [
+        ("points3D.txt", 0, 2, "points3D.txt: .* point 1: its position"),
+        ("images.txt", 1, 6, "images.txt: .* image 0.png: its pose"),
+    ],
+)
+def test_poses_and_points_of_colmap_that_are_not_finite_are_named(
+    tmp_path, file, record, column, place, number
+):
+    model = tmp_path / "sparse/0"
+    colmap(model, NAMES)
+    lines = (model / file).read_text().splitlines()
+    words = lines[record].split()
+    words[column] = number
+    lines[record] = " ".join(words)
+    (model / file).write_text("\n".join(lines))
+    with pytest.raises(InputError, match=place):
+        read_source(tmp_path, need_files=False)
+
+
 def test_bytes_behind_the_last_record_of_colmap_are_refused(tmp_path):
     model = rig(tmp_path / "sparse/0", ["front/", "left/"], [0, 1], binary=True)
     with (model / "cameras.bin").open("ab") as file:

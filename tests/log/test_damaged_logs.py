@@ -110,14 +110,6 @@ def test_poses_of_undefined_actors_are_left_out_and_named(path):
     assert log.info["undefined_actors"] == ("hidden",)
 
 
-def test_entry_of_a_future_kind_is_skipped_with_a_warning(path):
-    body = b"\xfa\x01\x02\x08\x01"
-    path.write_bytes(path.read_bytes() + struct.pack(">I", len(body)) + body)
-    log = read_asl(path)
-    assert "1 entries of a kind that this version does not know" in log.warnings[0]
-    assert len(log.images) == 5
-
-
 class Bomb:
     """Raises when unpickled."""
 

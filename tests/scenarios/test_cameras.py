@@ -120,6 +120,24 @@ def test_a_transforms_json_that_is_no_calibration_is_refused(tmp_path, axes, nam
 
 
 @pytest.mark.parametrize(
+    ("key", "problem"),
+    [
+        ('"is_fisheye": true', "frame/is_fisheye"),
+        ('"rolling_shutter": [0, 0, 1, 0]', "frame/rolling_shutter"),
+        ('"camera_model": "OPENCV_FISHEYE", "k5": 0.1', "k5, p2, which a fisheye lens"),
+    ],
+)
+def test_keys_of_a_rig_that_are_not_read_are_refused(tmp_path, key, problem):
+    harmless = '"file_path": "a.png", "is_fisheye": false, "camera_angle_x": 1.1'
+    rig = RIG % ("opencv", "round", 1)
+    (tmp_path / "rig.json").write_text(rig.replace('"k1": -0.1', f'"k1": -0.1, {harmless}'))
+    assert len(load_scenario(written(tmp_path, "{from: rig.json, width: 320}")).cameras) == 2
+    (tmp_path / "rig.json").write_text(rig.replace('"k1": -0.1', f'"k1": -0.1, {key}'))
+    with pytest.raises(InputError, match=problem):
+        load_scenario(written(tmp_path, "{from: rig.json, width: 320}"))
+
+
+@pytest.mark.parametrize(
     ("cameras", "named"),
     [
         ("[{hfov_deg: 165}]", "hfov_deg"),

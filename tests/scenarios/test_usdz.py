@@ -223,26 +223,38 @@ def test_the_front_wide_camera_of_a_calibration_table(tmp_path):
     )  # turned left by the correction: looks along y
 
 
-def test_a_property_of_a_lens_that_is_not_read_is_refused_where_the_lens_is_drawn(tmp_path):
-    properties = {"Model": "ftheta", "width": "3848", "height": "2168", "cx": "1924", "cy": "1084"}
-    properties |= {"polynomial": "0.0 0.00053 0 0 0", "polynomial-type": "pixeldistance-to-angle"}
-    nominal = {"roll-pitch-yaw": [0.0, 0.0, 0.0], "t": [1.7, 0.1, 1.4]}
-    for more, refused in (({}, False), ({"windshield": "0.1 0.2"}, True)):
-        sensor = {
-            "name": "camera:front:wide:120fov",
-            "properties": properties | more,
-            "nominalSensor2Rig_FLU": nominal,
-        }
-        row = {"calibration_estimate": {"rig_json": json.dumps({"rig": {"sensors": [sensor]}})}}
-        content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
-        path = write(tmp_path / "a.usdz", content)
-        assert ("properties/windshield (1)" in str(read_usdz(path).notes)) == refused
-        if refused:
-            with pytest.raises(InputError, match="properties/windshield"):
-                rig_cameras(path)
+FTHETA = {
+    "Model": "ftheta",
+    **{"width": "3848", "height": "2168", "cx": "1924", "cy": "1084"},
+    **{"polynomial": "0.0 0.00053 0 0 0", "polynomial-type": "pixeldistance-to-angle"},
+}
+
+
+@pytest.mark.parametrize(
+    ("properties", "sensor", "problem"),
+    [
+        ({}, {"car-mask": {}, "parameter": "", "protocol": "camera.virtual"}, ""),
+        ({"windshield": "0.1 0.2"}, {}, "properties/windshield"),
+        ({}, {"correction_rig_R": [0.0, 0.0, 90.0]}, "sensor/correction_rig_R"),
+        ({"polynomial-type": "pixel-to-tangent"}, {}, "of type 'pixel-to-tangent'"),
+    ],
+)
+def test_a_field_of_a_camera_that_is_not_read_is_refused_by_every_reader_of_rigs(
+    tmp_path, properties, sensor, problem
+):
+    mount = {"roll-pitch-yaw": [0.0, 0.0, 0.0], "t": [1.7, 0.1, 1.4]}
+    camera = {"name": "camera:front:wide:120fov", "nominalSensor2Rig_FLU": mount, **sensor}
+    rig_json = json.dumps({"rig": {"sensors": [{**camera, "properties": FTHETA | properties}]}})
+    row = {"calibration_estimate": {"rig_json": rig_json}}
+    content = members() | {"clipgt/calibration_estimate.parquet": parquet([row])}
+    path = write(tmp_path / "a.usdz", content)
+    for cameras_of in (rig_cameras, lambda path: read_usdz(path).cameras):
+        if problem:
+            with pytest.raises(InputError, match=problem):
+                cameras_of(path)
         else:
-            (camera,) = rig_cameras(path)
-            assert camera.name == "camera_front_wide_120fov"
+            (front,) = cameras_of(path)
+            assert front.name == "camera_front_wide_120fov"
 
 
 def test_a_scene_is_a_scenario_and_keeps_its_coordinates(tmp_path):
