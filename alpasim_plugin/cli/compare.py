@@ -1,8 +1,6 @@
 """``simrun compare``: means and paired differences within a run, between two runs, or over shards."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import Annotated, Any
@@ -12,21 +10,18 @@ from alpasim_plugin.cli.output import first_screen, show, terminal_width, warn
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.json_types import JsonObject
-from alpasim_plugin.log.run_folder.rows import Rollout
-from alpasim_plugin.log.run_folder.schema import cell_name
-from alpasim_plugin.runs.summary import aggregate_runs, joined_metrics
+from alpasim_plugin.runs.joined import join_runs
+from alpasim_plugin.runs.summary import joined_metrics
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics import MetricTable
 from evaluators.pages.tables import PairRow, pair_rows
 from evaluators.pages.terminal import metric_lines
-from evaluators.results import Censoring, Difference, Mean, Summary, to_json
+from evaluators.results import Difference, Mean, to_json
 from evaluators.statistics.across import Comparison, compare_runs, compare_within
 from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run, read_run
-from evaluators.statistics.outcomes import LISTED, outcome_table
 from evaluators.statistics.paired import BLOCKS
-from evaluators.statistics.summary import joined_censoring
 
 EPILOG = """
 Examples:
@@ -101,22 +96,13 @@ def compare(
 
 def _joined(shards: Sequence[Run], baseline: str | None) -> tuple[Comparison, Run]:
     """Return the comparison over the shards of one run, and the run that they make together."""
-    folders = [shard.folder for shard in shards]
-    summary = aggregate_runs(folders, baseline)
+    whole = join_runs(shards, baseline)
+    summary = whole.summary
     comparison = Comparison(
         summary.paired,
         summary.paired_with_base,
         summary.paired_policies,
-        metrics=joined_metrics(folders),
-    )
-    rollouts = [rollout for shard in shards for rollout in shard.rollouts]
-    names = dict.fromkeys(name for shard in shards for name in shard.info.asked or ())
-    scenes = {name: scene for shard in shards for name, scene in shard.info.scenes.items()}
-    whole = replace(
-        shards[0],
-        summary=_with_endings(summary, shards, rollouts),
-        rollouts=rollouts,
-        info=replace(shards[0].info, asked=tuple(names), scenes=scenes),
+        metrics=joined_metrics([shard.folder for shard in shards]),
     )
     return comparison, whole
 
@@ -170,32 +156,6 @@ def _tables_as_json(tables: Mapping[str, Mapping[str, Mean | Difference]]) -> Js
         variant: {metric: to_json(entry) for metric, entry in entries.items()}
         for variant, entries in tables.items()
     }
-
-
-def _with_endings(joined: Summary, runs: Sequence[Run], rollouts: Sequence[Rollout]) -> Summary:
-    """Return the joined summary of some runs with how their rollouts ended, the times of their
-    events, and what their own summaries say was removed.
-    """
-    outcomes = outcome_table(rollouts)
-    for variant, endings in outcomes.items():
-        tables = [run.summary.outcomes for run in runs if variant in run.summary.outcomes]
-        counts = {}
-        for name, events in endings.outcomes.items():
-            cells = [
-                table[variant].outcomes[name].cells
-                for table in tables
-                if name in table[variant].outcomes
-            ]
-            counts[name] = replace(events, cells=tuple(chain(*cells))[:LISTED])
-        outcomes[variant] = replace(endings, outcomes=counts)
-    ledgers: dict[str, list[Censoring]] = {}
-    for run in runs:
-        for renderer, ledger in run.summary.censoring.items():
-            is_key = renderer in joined.metrics
-            key = renderer if is_key else cell_name(renderer, run.policies[0])
-            ledgers.setdefault(key, []).append(ledger)
-    censoring = {key: joined_censoring(parts) for key, parts in ledgers.items()}
-    return replace(joined, outcomes=outcomes, censoring=censoring)
 
 
 def _table(

@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,11 +14,13 @@ from alpasim_plugin.cli.output import Progress, show, warn
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import PAGES
+from alpasim_plugin.runs.joined import check_apart, join_runs, missing_shards
 from alpasim_plugin.runs.reports import write_reports
 from alpasim_plugin.runs.self_test import run_self_test
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
 from evaluators.pages.ci import write_gate_files
+from evaluators.results import Outcome
 from evaluators.statistics.baselines import (
     Baseline,
     check_matches,
@@ -46,6 +49,8 @@ Examples:
 
 - `simrun gate runs/main --write-baseline baseline.json`, then `simrun gate runs/change --gate gate.yaml --baseline-file baseline.json`
 
+- `simrun gate runs/night-1 runs/night-2 runs/night-3 --out runs/night`: one verdict on the shards of a run
+
 - `simrun gate suites/urban --gate release.yaml`: whether these scenes can decide, before they are driven
 
 - `simrun gate --self-test`
@@ -56,10 +61,13 @@ Exit codes: 0 pass, 1 regression, 2 bad input, another baseline or a broken poli
 
 
 def gate(
-    run: Annotated[
-        Path | None,
-        Positional("A run folder; by default the newest. Or a suite that has not been driven."),
-    ] = None,
+    runs: Annotated[
+        tuple[Path, ...],
+        Positional(
+            "A run folder, by default the newest; or all shards of a run; or a suite that has not been driven.",
+            metavar="RUN...",
+        ),
+    ] = (),
     gate_file: Annotated[
         str, Flag("A gate file, or the name of a shipped gate.", "--gate")
     ] = "default",
@@ -70,39 +78,64 @@ def gate(
         Path | None, Flag("Store the run as a baseline and stop.", "--write-baseline")
     ] = None,
     self_test: Annotated[bool, Flag("Fail unless the gate catches each broken renderer.")] = False,
-    out: Annotated[Path | None, Flag("Where gate.md and gate.junit.xml go.")] = None,
+    out: Annotated[
+        Path | None, Flag("Where gate.md and gate.junit.xml go; default: into the run folder.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check a run against a gate, or test the gate on broken renderers.
 
-    Of a suite it says, before anything is driven, whether its scenes are enough for the gate.
+    The shards of one run are joined, and the verdict is about all of their scenes. Of a suite it
+    says, before anything is driven, whether its scenes are enough for the gate.
     """
     if self_test:
-        if run is not None or baseline_file is not None or approve is not None:
+        if runs or baseline_file is not None or approve is not None:
             raise InputError(
                 "--self-test: a run or baseline is named", "Give --gate and --out only."
             )
         raise typer.Exit(_self_test(gate_file, out, as_json))
-    if run is not None and not os.path.isdir(run):
-        _check_suite(str(run), gate_file, baseline_file or approve or out, as_json)
+    if len(runs) == 1 and not os.path.isdir(runs[0]):
+        _check_suite(str(runs[0]), gate_file, baseline_file or approve or out, as_json)
         return
-    run = run_or_newest(run)
-    ensure_tables(run, warn)
-    stored_run = read_run(run)
+    run, absent = _opened([run_or_newest(folder) for folder in runs] or [run_or_newest(None)])
     if approve is not None:
-        write_baseline(stored_run, approve)
+        if absent is not None:
+            raise InputError(f"{run.title}: {absent}", "Name the runs of all shards.")
+        write_baseline(run, approve)
         show(as_json, {"baseline": str(approve)}, f"baseline  {approve}")
         return
-    if note := stopping_note(run):
-        warn(note)
-    spec, source = load_gate(gate_file, stored_run.table)
-    verdict = _verdict(stored_run, spec, source, baseline_file)
-    files = write_gate_files(verdict, source, stored_run, out or run)
-    if out is None and os.path.isfile(run / PAGES[0]):
-        write_reports(run)
+    spec, source = load_gate(gate_file, run.table)
+    verdict = _verdict(run, spec, source, baseline_file)
+    if absent is not None:
+        verdict = verdict.with_outcome(Outcome("incomplete", (absent,)))
+    folder = out if run.folders else out or run.folder
+    files = write_gate_files(verdict, source, run, folder)
+    if out is None and not run.folders and os.path.isfile(run.folder / PAGES[0]):
+        write_reports(run.folder)
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
-    show(as_json, facts, *verdict_lines(verdict))
+    lines = verdict_lines(verdict)
+    if folder is None:
+        lines.append("gate.md and gate.junit.xml of several runs are written with --out FOLDER")
+    show(as_json, facts, *lines)
     raise typer.Exit(verdict.exit_code)
+
+
+def _opened(folders: Sequence[Path]) -> tuple[Run, str | None]:
+    """Return a run, or the one that several shards make together, and which shards it lacks.
+
+    Raises:
+        InputError: A run is not finished, or the runs are not shards of one.
+    """
+    for folder in folders:
+        ensure_tables(folder, warn)
+        if note := stopping_note(folder):
+            warn(note)
+    runs = [read_run(folder) for folder in folders]
+    absent = missing_shards([run.info for run in runs])
+    if len(runs) == 1:
+        return runs[0], absent
+    check_apart(runs)
+    return join_runs(runs), absent
 
 
 def _verdict(run: Run, spec: GateSpec, source: str, baseline_file: Path | None) -> GateVerdict:
@@ -114,11 +147,16 @@ def _verdict(run: Run, spec: GateSpec, source: str, baseline_file: Path | None) 
     preset = run.summary.preset
     if spec.preset is not None and spec.preset != preset:
         raise InputError(
-            f"{run.folder}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
+            f"{run.title}: preset {preset!r}, the gate {source} is for {spec.preset!r}",
             "Score the run with that preset.",
         )
     baseline_name = str(baseline_file or "")
     if spec.boundary_margin is not None:
+        if run.folders:
+            raise InputError(
+                f"{run.title}: several runs, and the gate has boundary_margin",
+                "A search along a parameter is one run: name that run alone.",
+            )
         earlier = None
         if baseline_file is not None:
             earlier = read_run(baseline_file).summary.boundary or {}

@@ -265,7 +265,7 @@ def run(
     refs = rollouts.scenes(scenarios)
     planned = rollouts.planner(options)
     sweeps = search_options.sweeps(len(refs), execution)
-    plan = replace(planned(refs), scenario_names=scenarios)
+    plan = replace(planned(refs), scenario_names=scenarios, shard=rollouts.shard)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")

@@ -117,6 +117,7 @@ class RunPlan:
 
     Attributes:
         scenario_names: The scenarios as the command named them: files, folders, suites; in no key.
+        shard: Which part of their scenes this is, ``I/N``; None: all of them; in no key.
         question: Digest of a question that decides which of the rollouts are driven; empty where all
             are.
         whole: The plan that this is a part of, whose keys it bears; see `part_of`.
@@ -129,6 +130,7 @@ class RunPlan:
     seeds: tuple[int, ...]
     options: RunOptions
     scenario_names: tuple[str, ...] = ()
+    shard: str | None = None
     question: str = ""
     whole: RunPlan | None = None
 

@@ -385,6 +385,7 @@ def run_info(plan: RunPlan, command: Sequence[str], threads: Threads) -> RunInfo
         started_at=now(),
         project=project(),
         asked=plan.scenario_names,
+        shard=plan.shard,
         bases={spec.name: spec.base.name for spec in plan.renderers if spec.fixer is not None},
         fixers={name: part_facts(fixer) for name, fixer in fixers.items()},
         parts={f"{part.kind} {part.name}": part_facts(part) for part in parts},

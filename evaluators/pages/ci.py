@@ -195,7 +195,7 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
     with_values = len(run.rollouts) <= MAX_WITH_VALUES
     return Suite(
         # what the command named, if that was one thing
-        named[0] if len(named) == 1 else real(run.folder).name,
+        named[0] if len(named) == 1 else name_of(run),
         [
             _rollout_case(rollout, with_values, outcomes_fail, accepts_failures)
             for rollout in run.rollouts
@@ -203,6 +203,11 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
         {key: value for key, value in facts.items() if value},
         run.info.started_at or "",
     )
+
+
+def name_of(run: Run) -> str:
+    """Return the name of a run's folder, or of those of the runs that were joined."""
+    return ", ".join(real(folder).name for folder in run.folders or (run.folder,))
 
 
 def _rollout_case(
@@ -261,11 +266,20 @@ def check_suite(verdict: GateVerdict, gate: str) -> Suite:
     return Suite(f"gate {gate}", cases)
 
 
-def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) -> list[Path]:
+def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path | None) -> list[Path]:
     """Write ``gate.md``, ``gate.junit.xml`` and in the run folder ``gate.json``; append the
     Markdown to what $GITHUB_STEP_SUMMARY names.
 
     How the rollouts ended fails nothing in ``gate.junit.xml``: the gate's checks are the verdict.
+
+    Args:
+        verdict: What `evaluators.statistics.gate.check_gate` gave.
+        gate: Name or file of the gate.
+        run: The run that was gated, or several that were joined.
+        folder: Where the files go; None: nowhere.
+
+    Returns:
+        The files that were written.
 
     Raises:
         InfrastructureError: The disk refused.
@@ -280,16 +294,18 @@ def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path) ->
         names = [pair["scene"], f"{pair['renderer']}/{pair['policy']}", pair["seed"]]
         worst.append([*names, pair["metric"], short(pair["was"]), short(pair["now"])])
     text = MARKDOWN.get_template("gate.md.j2").render(
-        verdict=verdict, gate=gate, run=run.folder, checks=checks, worst=worst, **_first_screen(run)
+        verdict=verdict, gate=gate, run=run.title, checks=checks, worst=worst, **_first_screen(run)
     )
+    _append_job_summary(text)
+    if folder is None:
+        return []
     folder.mkdir(parents=True, exist_ok=True)
     page = folder / "gate.md"
     write_text(page, cut(text))
     rollouts = rollout_suite(run, outcomes_fail=False, accepts_failures=verdict.accepts_failures)
     suites = [check_suite(verdict, gate), rollouts]
     tests = _write_suites(folder / "gate.junit.xml", suites)
-    _append_job_summary(text)
-    if real(folder) != real(run.folder):
+    if run.folders or real(folder) != real(run.folder):
         return [page, tests]
     return [page, tests, write_gate(run, verdict, gate)]
 

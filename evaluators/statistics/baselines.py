@@ -16,9 +16,7 @@ from alpasim_plugin.core.files.limits import JSON_BYTES
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.log.run_folder.checksums import DIGEST, check_seal, sealed
-from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.records import json_of
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS
 from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.metrics import MetricTable
 from evaluators.statistics.opening import Run, read_run
@@ -40,13 +38,13 @@ APPROVE = "make the run again as the baseline was made, or approve a new baselin
 
 
 def table_of_run(run: Run) -> RolloutTable:
-    """Return the rollouts of a run as columns, read from its folder one metric at a time.
+    """Return the rollouts of a run as columns, read from its tables one metric at a time.
 
     Raises:
         InputError: ``rollouts.parquet`` cannot be read.
     """
     return RolloutTable.of_files(
-        [table_path(run.folder, ROLLOUTS)],
+        run.tables,
         lambda renderer, metric: run.invalid_reasons.get((renderer, metric), ""),
     )
 
@@ -125,7 +123,7 @@ def write_baseline(run: Run, path: Path) -> None:
     n_failed = sum(not rollout.ok for rollout in run.rollouts)
     if n_failed or not run.rollouts:
         raise InputError(
-            f"{run.folder}: {n_failed} of {len(run.rollouts)} rollouts failed",
+            f"{run.title}: {n_failed} of {len(run.rollouts)} rollouts failed",
             "store a run with rollouts that all ran to their end",
         )
     write_json(path, sealed(json_of(baseline_of(run))))

@@ -245,6 +245,10 @@ class GateVerdict:
         """Give the process exit code."""
         return self.outcome.exit_code
 
+    def with_outcome(self, outcome: Outcome) -> GateVerdict:
+        """Return the verdict that follows where another outcome is known besides."""
+        return replace(self, outcome=worst([self.outcome, outcome]))
+
     def as_dict(self) -> JsonObject:
         """Return the verdict for JSON."""
         checks = [asdict(check) for check in self.checks]

@@ -11,7 +11,7 @@ from typing import Self
 from alpasim_plugin.log.run_folder import reader
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.records import RunInfo
-from alpasim_plugin.log.run_folder.schema import SUMMARY
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, SUMMARY
 from evaluators.metrics import MetricTable
 from evaluators.results import Failures, Summary, read_summary
 
@@ -25,9 +25,11 @@ class Run(reader.Run):
 
     Attributes:
         summary: ``summary.json``; `NO_SUMMARY` where the run is not finished.
+        folders: Of several runs that were joined; empty where this is the run of ``folder`` alone.
     """
 
     summary: Summary = NO_SUMMARY
+    folders: tuple[Path, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Self:
@@ -40,6 +42,16 @@ class Run(reader.Run):
         run = super().read(folder)
         path = table_path(folder, SUMMARY)
         return replace(run, summary=read_summary(path, command_again(run.info)))
+
+    @property
+    def tables(self) -> list[Path]:
+        """List the files that hold the rollouts' results."""
+        return [table_path(folder, ROLLOUTS) for folder in self.folders or (self.folder,)]
+
+    @property
+    def title(self) -> str:
+        """Give the run's folder, or those of the runs that were joined, for sentences."""
+        return ", ".join(map(str, self.folders or (self.folder,)))
 
     @property
     def is_finished(self) -> bool:
@@ -61,6 +73,11 @@ class Run(reader.Run):
         """Give per (renderer, metric) why rollouts have no valid value: the most frequent reason,
         from the ledger or else the steps.
         """
+        if self.folders:
+            joined: dict[tuple[str, str], str] = {}
+            for folder in self.folders:
+                joined |= read_run(folder).invalid_reasons
+            return joined
         reasons = dict(super().invalid_reasons)
         for renderer, ledger in self.summary.censoring.items():
             for metric, invalid in ledger.invalid.items():

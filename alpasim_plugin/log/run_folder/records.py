@@ -511,6 +511,7 @@ class RunInfo:
         started_at: Date and time in UTC, ISO 8601.
         project: The repository from which the command was given.
         asked: The scenarios as the command named them.
+        shard: Which part of their scenes was driven, ``I/N``; None: all of them.
         bases: RENDERER with a fixer -> the renderer below it.
         fixers: RENDERER -> its fixer.
         parts: ``KIND NAME`` -> facts of each part.
@@ -549,6 +550,7 @@ class RunInfo:
     started_at: str | None = None
     project: Project | None = None
     asked: tuple[str, ...] | None = None
+    shard: str | None = None
     bases: dict[str, str] = field(default_factory=dict)
     fixers: dict[str, PartFacts] = field(default_factory=dict)
     parts: dict[str, PartFacts] = field(default_factory=dict)
