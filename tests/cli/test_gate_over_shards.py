@@ -1,9 +1,15 @@
 """``simrun gate RUN RUN...``: one verdict on the shards of a run."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import pytest
+import yaml
 
 from alpasim_plugin.cli.main import run_command
 from tests.core.checksum_files import vouch_for
@@ -71,7 +77,8 @@ def test_all_shards_have_one_verdict_and_the_worst_scene_of_any_is_in_it(
         SCENES[2::3]
     )
     page = (out / "gate.md").read_text()
-    assert "Gate: " in page and all(str(shards[name]) in page for name in "123")
+    assert "Gate: " in page
+    assert all(str(shards[name]) in page for name in "123")
     cases = ET.parse(out / "gate.junit.xml").getroot().iter("testcase")
     rollouts = [case for case in cases if not case.get("classname").startswith("gate.")]
     assert len(rollouts) == 2 * 2 * len(SCENES)
@@ -81,7 +88,8 @@ def test_all_shards_have_one_verdict_and_the_worst_scene_of_any_is_in_it(
 def test_shards_that_are_all_good_pass_in_any_order(shards, gate, capsys):
     names = ("good", "1", "2")
     code, facts = gate(capsys, *(shards[name] for name in names))
-    assert code == 0 and facts["files"] == []
+    assert code == 0
+    assert facts["files"] == []
     again, other = gate(capsys, *(shards[name] for name in reversed(names)))
     assert again == 0
     assert [check["text"] for check in other["checks"]] == [
@@ -100,7 +108,8 @@ def test_some_shards_alone_are_incomplete_and_say_which_are_missing(
     shards, gate, capsys, names, sentence
 ):
     code, facts = gate(capsys, *(shards[name] for name in names))
-    assert code == 2 and facts["outcome"]["cause"] == "incomplete"
+    assert code == 2
+    assert facts["outcome"]["cause"] == "incomplete"
     assert sentence in " ".join(facts["outcome"]["reasons"])
 
 
@@ -157,3 +166,32 @@ def test_shards_of_other_code_are_not_joined(shards, tmp_path, gate, capsys):
     )
     assert run_command(["gate", str(first), str(second)]) == 2
     assert "policy mine has other code, settings or files" in capsys.readouterr().err
+
+
+ACTION = Path(__file__).parents[2] / ".github" / "actions" / "simrun-gate" / "action.yml"
+
+
+def test_the_action_judges_all_folders_that_a_pattern_names(shards, tmp_path):
+    action = yaml.safe_load(ACTION.read_text())
+    defaults = {name: facts["default"] for name, facts in action["inputs"].items()}
+    (step,) = [step for step in action["runs"]["steps"] if step.get("id") == "gate"]
+    inputs = defaults | {"runs": "runs/part-*", "gate": "gate.yaml"}
+    environment = {
+        name: inputs[text.removeprefix("${{ inputs.").removesuffix(" }}")]
+        for name, text in step["env"].items()
+    }
+    (tmp_path / "gate.yaml").write_text(GATE)
+    for name in "123":
+        shutil.copytree(shards[name], tmp_path / "runs" / f"part-{name}")
+    output = tmp_path / "output"
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-e", "-c", step["run"]],
+        cwd=tmp_path,
+        env={**os.environ, **environment, "GITHUB_OUTPUT": str(output), "PATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1, done.stderr
+    assert output.read_text() == "exit-code=1\n"
+    assert (tmp_path / "gate" / "gate.junit.xml").is_file()
