@@ -91,9 +91,9 @@ def missing_shards(infos: Sequence[RunInfo]) -> str | None:
     absent = [f"{number}/{count}" for number in range(1, count + 1) if number not in present]
     if not absent:
         return None
-    what = f"shard {absent[0]} is" if len(absent) == 1 else f"shards {_listed(absent)} are"
+    subject = f"shard {absent[0]} is" if len(absent) == 1 else f"shards {_listed(absent)} are"
     return (
-        f"{what} missing: the verdict is about the scenes of all {count} shards,"
+        f"{subject} missing: the verdict is about the scenes of all {count} shards,"
         " so name their runs as well"
     )
 
