@@ -185,6 +185,28 @@ class CellNames:
     scene: str
     seed: int
 
+    @property
+    def cell(self) -> tuple[str, str, str, int]:
+        """Give the key renderer, policy, scene, seed."""
+        return (self.renderer, self.policy, self.scene, self.seed)
+
+
+@dataclass(frozen=True)
+class CellStatus(CellNames):
+    """How a rollout went, by its key.
+
+    Attributes:
+        renderer, policy, scene, seed: Its key.
+        status: It ran to its end and was scored, or not.
+    """
+
+    status: Status
+
+    @property
+    def ok(self) -> bool:
+        """Tell whether the rollout ran to its end and was scored."""
+        return self.status == "ok"
+
 
 @dataclass(frozen=True)
 class LogDifference:
@@ -345,13 +367,13 @@ class SceneScore:
 
 
 @dataclass(frozen=True)
-class Manifest:
+class Manifest(CellStatus):
     """``manifest.json`` of a rollout, which is written last: a rollout without one is unfinished.
 
     Attributes:
         renderer, policy, scene, seed: Its key.
-        path: Its folder below the run folder.
         status: It ran to its end and was scored, or not.
+        path: Its folder below the run folder.
         wall_s: Seconds that it took; None where it was never driven to its end.
         files: Name of each file in the folder -> its digest; empty of a failed rollout.
         rollout_key: Digest of ``made_of``.
@@ -391,12 +413,7 @@ class Manifest:
         node: Where Ray drove it.
     """
 
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
     path: str
-    status: Status
     wall_s: float | None
     files: dict[str, FileFacts] = field(default_factory=dict)
     rollout_key: str | None = None
@@ -434,16 +451,6 @@ class Manifest:
     scene_score: SceneScore | None = None
     fork: Fork | None = None
     node: str | None = None
-
-    @property
-    def ok(self) -> bool:
-        """Tell whether the rollout ran to its end and was scored."""
-        return self.status == "ok"
-
-    @property
-    def cell(self) -> tuple[str, str, str, int]:
-        """Give the key renderer, policy, scene, seed."""
-        return (self.renderer, self.policy, self.scene, self.seed)
 
     @property
     def failure_class(self) -> str:

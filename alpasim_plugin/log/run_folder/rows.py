@@ -11,24 +11,22 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from alpasim_plugin.core.types import F64, I64
+from alpasim_plugin.log.run_folder.records import CellStatus
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, cell_name, metrics_in
 
 
 @dataclass(frozen=True)
-class Rollout:
+class Rollout(CellStatus):
     """One row of ``rollouts.parquet``.
 
     Attributes:
+        renderer, policy, scene, seed: Its key.
+        status: It ran to its end and was scored, or not.
         metrics: Rollout values; None where the metric is invalid or was not computed.
         path: Folder of the rollout relative to the run folder, POSIX separators.
         copied_from: That of the rollout that it is a copy of; empty for a rollout that was driven.
     """
 
-    renderer: str
-    policy: str
-    scene: str
-    seed: int
-    status: str
     failure_class: str = ""
     failure: str = ""
     path: str = ""
@@ -37,16 +35,6 @@ class Rollout:
     frames: int | None = None
     steps: int | None = None
     metrics: Mapping[str, float | None] = field(default_factory=dict)
-
-    @property
-    def ok(self) -> bool:
-        """Return whether the rollout ran to its end."""
-        return self.status == "ok"
-
-    @property
-    def cell(self) -> tuple[str, str, str, int]:
-        """Give the key renderer, policy, scene, seed."""
-        return (self.renderer, self.policy, self.scene, self.seed)
 
     def flag(self, *names: str) -> bool:
         """Return whether any of the named 0/1 metrics is 1."""
