@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log.run_folder.records import Contact
 from evaluators.metrics import nuplan
 from evaluators.metrics.contact import (
     FRONT,
     LATERAL,
     REAR,
+    Contacts,
     SweptContacts,
     find_contacts,
     find_swept,
@@ -98,76 +99,64 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     ego = ego_footprints(rollout, preset, origin)
     actors = ActorTable(rollout, preset, origin)
     contacts, gap_m = find_contacts(ego, actors, t_us)
-    if preset.hits == "last":
+    is_last_only = preset.hits == "last"
+    if is_last_only:
         contacts = last_per_step(contacts, ego, actors, t_us)
-    step = contacts.step
-    side = contacts.side
-    actor = contacts.actor
     first = []
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
-        step = swept.step
-        side = swept.side
-        actor = swept.actor
+        contacts = Contacts(swept.step, swept.actor, swept.side)
         first = _first_contacts(rollout, swept)
-        gap_m[step] = 0.0
+        gap_m[swept.step] = 0.0
     touched = np.zeros((3, len(t_us)), dtype=np.bool_)
-    touched[side, step] = True
-    front = touched[FRONT]
-    rear = touched[REAR]
-    lateral = touched[LATERAL]
-    is_present = np.isfinite(gap_m)
-
-    at_fault = front | lateral
-    if preset.fault == "nuplan" and len(step):
-        guilty = _at_fault(ScoredRollout(rollout, scene, preset, rollout.ego), actor, side, step)
-        at_fault = np.zeros_like(front)
-        at_fault[step[guilty]] = True
-
-    def flag(name: str, fired: Bool) -> MetricSeries:
-        return series(name, t_us, fired)
-
-    return [
-        flag("collision_any", front | rear | lateral),
-        *([] if preset.hits == "last" else [flag("collision_at_fault", at_fault)]),
-        flag("collision_front", front),
-        flag("collision_lateral", lateral),
-        flag("collision_rear", rear),
-        *(
-            [flag("collision_standing", _standing(actors, actor, step, len(t_us)))]
-            if scene.standing == "found"
-            else []
-        ),
-        series(
-            "min_distance_to_obstacle_m",
-            t_us,
-            gap_m,
-            is_present,
-            "no other actor is present",
-            keep_values=not preset.honour_valid,
-        ),
-        *first,
-    ]
+    touched[contacts.side, contacts.step] = True
+    flags = {"collision_any": touched.any(axis=0)}
+    if not is_last_only:
+        flags["collision_at_fault"] = touched[FRONT] | touched[LATERAL]
+        if preset.fault == "nuplan":
+            flags["collision_at_fault"] = _by_fault_of_ego(rollout, scene, preset, contacts)
+    flags["collision_front"] = touched[FRONT]
+    flags["collision_lateral"] = touched[LATERAL]
+    flags["collision_rear"] = touched[REAR]
+    if scene.standing == "found":
+        flags["collision_standing"] = _with_standing(actors, contacts, len(t_us))
+    nearest = series(
+        "min_distance_to_obstacle_m",
+        t_us,
+        gap_m,
+        np.isfinite(gap_m),
+        "no other actor is present",
+        keep_values=not preset.honour_valid,
+    )
+    return [*(series(name, t_us, fired) for name, fired in flags.items()), nearest, *first]
 
 
-def _at_fault(drive: ScoredRollout, actor: I64, side: I64, step: I64) -> Bool:
-    """Return of which contacts ``(M,)`` the ego is at fault by nuPlan's rules: it moves, and it
+def _by_fault_of_ego(rollout: RolloutLog, scene: Scene, preset: Preset, contacts: Contacts) -> Bool:
+    """Return ``(T,)`` whether the ego is at fault for a contact by nuPlan's rules: it moves, and it
     touches what stands, or somebody with its front, or at its side while no lane holds it.
     """
+    fired = np.zeros(len(rollout.ego.t_us), dtype=np.bool_)
+    if not len(contacts.step):
+        return fired
+    drive = ScoredRollout(rollout, scene, preset, rollout.ego)
     tracks = drive.tracks
+    step = contacts.step
+    actor = contacts.actor
     stands = tracks.is_present[actor, step] & (tracks.speed[actor, step] <= nuplan.STOPPED_MPS)
-    between = (side == LATERAL) & (False if drive.astray is None else drive.astray[step])
-    guilty = stands | (side == FRONT) | between
-    return guilty & (drive.ego.speed[step] > nuplan.STOPPED_MPS)
+    is_astray = False if drive.astray is None else drive.astray[step]
+    between_lanes = (contacts.side == LATERAL) & is_astray
+    moves = drive.ego.speed[step] > nuplan.STOPPED_MPS
+    fired[step[moves & (stands | (contacts.side == FRONT) | between_lanes)]] = True
+    return fired
 
 
-def _standing(actors: ActorTable, actor: I64, step: I64, count: int) -> Bool:
-    """Return at which steps something touches the ego that was found standing in a
+def _with_standing(actors: ActorTable, contacts: Contacts, count: int) -> Bool:
+    """Return at which of ``count`` steps something touches the ego that was found standing in a
     reconstruction.
     """
     stands = np.array([name.startswith(STANDING_ID) for name in actors.ids], dtype=np.bool_)
     touched = np.zeros(count, dtype=np.bool_)
-    touched[step[stands[actor]]] = True
+    touched[contacts.step[stands[contacts.actor]]] = True
     return touched
 
 

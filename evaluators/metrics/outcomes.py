@@ -23,7 +23,7 @@ from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.motion import time_to_collision_s
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import (
-    DIRECTION_M,
+    NO_DIRECTION,
     followed,
     on_route,
     recorded_path,
@@ -225,15 +225,16 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
     )
     has_side = np.isfinite(on.lateral_m)
-    why = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
     stalled, braked = _slow(rollout, preset, path, line, s)
     # Behind the end of the recording nothing drove on with which a slow ego could be compared.
     stalled &= ~on.is_beyond
     braked &= ~on.is_beyond
     return [
-        series("stalled", t_us, stalled, has_side, why),
-        series("braked_without_cause", t_us, braked, has_side, why),
-        series("left_route", t_us, np.nan_to_num(on.lateral_m) >= LEFT_ROUTE_M, has_side, why),
+        series("stalled", t_us, stalled, has_side, NO_DIRECTION),
+        series("braked_without_cause", t_us, braked, has_side, NO_DIRECTION),
+        series(
+            "left_route", t_us, np.nan_to_num(on.lateral_m) >= LEFT_ROUTE_M, has_side, NO_DIRECTION
+        ),
         series("ended_in_danger", t_us, _in_danger(rollout, scene, preset)),
     ]
 

@@ -31,6 +31,9 @@ DIRECTION_M = 1.0
 STAND_M = 0.5
 SAME_M = 1e-6  # distances that differ by no more are equal
 BEHIND_END = "no recorded drive behind the end of the recording"
+OUTSIDE = "the recording does not cover this time"
+NO_LENGTH = "the recorded path has no length"
+NO_DIRECTION = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
 FOUND_M = 2.0  # a path that was left is found again where it is this near
 
 
@@ -262,83 +265,177 @@ def on_route(
     )
 
 
+@dataclass(frozen=True)
+class BesideRecording:
+    """The ego's box centres and the recorded drive's, in plan view, relative to the origin.
+
+    Attributes:
+        path_us: ``(N,)`` times of the recorded drive.
+        path: ``(N, 2)`` its positions.
+        t_us: ``(T,)`` times of the ego.
+        ego: ``(T, 2)`` where the ego is.
+        recorded: ``(T, 2)`` where the recording is at these times; it waits at its ends.
+        is_covered: ``(T,)`` whether the recording covers the time.
+    """
+
+    path_us: I64
+    path: F64
+    t_us: I64
+    ego: F64
+    recorded: F64
+    is_covered: Bool
+
+
+@dataclass(frozen=True)
+class RouteColumns:
+    """What is measured against the recorded drive at each step, ``(T,)`` each.
+
+    Attributes:
+        distance_m: From its path.
+        away_m: From where the recording is at the time.
+        share: Of its path that lies behind the ego; NaN where the path has no length.
+        so_far: As `progress_so_far`.
+        traveled_m: How far the ego has driven.
+        corridor_m: As `from_corridor`; None where the preset has none.
+    """
+
+    distance_m: F64
+    away_m: F64
+    share: F64
+    so_far: F64
+    traveled_m: F64
+    corridor_m: F64 | None
+
+
 def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> list[MetricSeries]:
     """Give the recording-based metrics and ``eval_relevant`` per step."""
+    drive = _beside_recording(rollout, preset)
+    length_m = float(arc_lengths(drive.path)[-1])
+    route = None
+    if not preset.aliases:
+        more = way_beyond(rollout, scene, preset)
+        route = on_route(drive.path, drive.path_us, drive.t_us, drive.ego, more)
+    columns = _columns(rollout, preset, drive, route)
+    if preset.invented_starts:
+        own_path = rollout.ego.xyz[:, :2] - origin_of(rollout.ego_log, preset)[:2]
+        columns = _with_invented_starts(columns, to_path(own_path, drive.ego)[1])
+    # A recording that stands at its end tells where to stop; one that goes on tells nothing more.
+    is_measured = np.ones(len(drive.t_us), dtype=np.bool_)
+    if route is not None and moves_at_end(rollout.ego_log):
+        is_measured = ~route.is_beyond
+    has_length = (length_m if route is None else route.length_m) > 0
+
+    def column(
+        name: str, value: F64 | Bool, valid: Bool | bool = True, reason: str = ""
+    ) -> MetricSeries:
+        return series(name, drive.t_us, value, valid, reason)
+
+    out = [
+        column("dist_to_gt_trajectory", columns.distance_m, is_measured, BEHIND_END),
+        column("dist_to_gt_location", columns.away_m, drive.is_covered, OUTSIDE),
+        column("progress", columns.share, has_length, NO_LENGTH),
+        column("progress_rel", columns.so_far, drive.is_covered, OUTSIDE),
+        column("dist_traveled_m", columns.traveled_m),
+        column("gt_dist_traveled_m", np.full(len(drive.t_us), length_m)),
+        column("eval_relevant", relevant(rollout)),
+    ]
+    if route is None:
+        return [*out, *_alpasim_series(drive, columns, length_m, preset)]
+    has_side = np.isfinite(route.lateral_m)
+    return [
+        *out,
+        column("lateral_distance_m", route.lateral_m, has_side, NO_DIRECTION),
+        column("route_distance_m", columns.distance_m, is_measured, BEHIND_END),
+        column("lateral_bias_m", route.side * route.lateral_m, has_side, NO_DIRECTION),
+    ]
+
+
+def _beside_recording(rollout: RolloutLog, preset: Preset) -> BesideRecording:
+    """Return where the ego and the recording are at the ego's times."""
     t_us = rollout.ego.t_us
     origin = origin_of(rollout.ego_log, preset)
     recorded = recorded_path(rollout, preset)
-    path = recorded.xyz[:, :2] - origin[:2]
-    ego = ego_footprints(rollout, preset, origin).centres()
-    distance_m, s = to_path(path, ego)
-    length_m = float(arc_lengths(path)[-1])
-    covered = (t_us >= recorded.t_us[0]) & (t_us <= recorded.t_us[-1])
-    recorded_xy = (
-        held(
-            interpolate(recorded, np.clip(t_us, recorded.t_us[0], recorded.t_us[-1]))[:, :3, 3],
-            preset,
-        )[:, :2]
-        - origin[:2]
+    first_us = recorded.t_us[0]
+    last_us = recorded.t_us[-1]
+    poses = interpolate(recorded, np.clip(t_us, first_us, last_us))
+    return BesideRecording(
+        path_us=recorded.t_us,
+        path=recorded.xyz[:, :2] - origin[:2],
+        t_us=t_us,
+        ego=ego_footprints(rollout, preset, origin).centres(),
+        recorded=held(poses[:, :3, 3], preset)[:, :2] - origin[:2],
+        is_covered=(t_us >= first_us) & (t_us <= last_us),
     )
-    away_m = np.hypot(*(ego - recorded_xy).T)
-    on = (
-        None
-        if preset.aliases
-        else on_route(path, recorded.t_us, t_us, ego, way_beyond(rollout, scene, preset))
+
+
+def _columns(
+    rollout: RolloutLog, preset: Preset, drive: BesideRecording, route: OnRoute | None
+) -> RouteColumns:
+    """Measure the ego against the recorded drive; along its path as ``route`` says, without it by
+    the nearest point of the whole path.
+    """
+    distance_m, along_m = to_path(drive.path, drive.ego)
+    corridor_m = None
+    if preset.corridor:
+        corridor_m = from_corridor(drive.path, along_m, drive.ego, distance_m)
+    length_m = float(arc_lengths(drive.path)[-1])
+    if route is not None:
+        along_m = route.along_m
+        length_m = route.length_m
+    driven_m = arc_lengths(drive.ego)
+    first = int(np.argmax(relevant(rollout))) if preset.distance_from == "handover" else 0
+    return RouteColumns(
+        distance_m=distance_m,
+        away_m=np.hypot(*(drive.ego - drive.recorded).T),
+        share=along_m / length_m if length_m > 0 else np.full(len(along_m), np.nan),
+        so_far=progress_so_far(drive.recorded, drive.ego),
+        traveled_m=np.maximum(driven_m - driven_m[first], 0.0),
+        corridor_m=corridor_m,
     )
-    share, of_m = (s, length_m) if on is None else (on.along_m, on.length_m)
-    share = share / of_m if of_m > 0 else np.full(len(s), np.nan)
-    no_direction = f"the recorded path is shorter than {DIRECTION_M:g} m: it has no direction"
-    no_length = "the recorded path has no length"
-    outside = "the recording does not cover this time"
-    lateral_m = from_corridor(path, s, ego, distance_m) if preset.corridor else None
-    engaged = relevant(rollout)
-    # A recording that stands at its end tells where to stop; one that goes on tells nothing more.
-    is_measured = np.ones(len(t_us), dtype=np.bool_)
-    if on is not None and moves_at_end(rollout.ego_log):
-        is_measured = ~on.is_beyond
-    so_far = progress_so_far(recorded_xy, ego)
-    driven_m = arc_lengths(ego)
-    first = int(np.argmax(engaged)) if preset.distance_from == "handover" else 0
-    traveled_m = np.maximum(driven_m - driven_m[first], 0.0)
-    if preset.invented_starts:
-        # AlpaSim fills the first two rows in by hand, and projects the ego on its own path instead
-        # of adding up its steps.
-        traveled_m = to_path(rollout.ego.xyz[:, :2] - origin[:2], ego)[1]
-        share[:2] = [0.0, share[2] / 2] if len(share) > 2 else 0.0
-        so_far[:2] = 1.0
-        for column in (
-            distance_m,
-            away_m,
-            traveled_m,
-            *(() if lateral_m is None else (lateral_m,)),
-        ):
-            column[:2] = 0.0
-    out = [
-        series("dist_to_gt_trajectory", t_us, distance_m, is_measured, BEHIND_END),
-        series("dist_to_gt_location", t_us, away_m, covered, outside),
-        series("progress", t_us, share, of_m > 0, no_length),
-        series("progress_rel", t_us, so_far, covered, outside),
-        series("dist_traveled_m", t_us, traveled_m),
-        series("gt_dist_traveled_m", t_us, np.full(len(t_us), length_m)),
-        series("eval_relevant", t_us, engaged),
-    ]
-    if on is None:
-        if lateral_m is not None and preset.stop_beyond_gt_m is not None:
-            out.append(series("lateral_dist_to_gt_trajectory", t_us, lateral_m))
-            out.append(
-                series("left_corridor_laterally", t_us, lateral_m >= preset.stop_beyond_gt_m)
-            )
-        if preset.progress_of == "reachable" and length_m > 0:
-            reached_m = float(to_path(path, recorded_xy[-1:])[1][0])
-            share = share * (length_m / reached_m if reached_m > 0 else 1.0)
-        return [*out, series("progress_rel_to_total", t_us, share, length_m > 0, no_length)]
-    has_side = np.isfinite(on.lateral_m)
-    return [
-        *out,
-        series("lateral_distance_m", t_us, on.lateral_m, has_side, no_direction),
-        series("route_distance_m", t_us, distance_m, is_measured, BEHIND_END),
-        series("lateral_bias_m", t_us, on.side * on.lateral_m, has_side, no_direction),
-    ]
+
+
+def _with_invented_starts(columns: RouteColumns, along_own_path_m: F64) -> RouteColumns:
+    """Return the columns with their first two rows as AlpaSim fills them in by hand.
+
+    Args:
+        columns: As they were measured.
+        along_own_path_m: ``(T,)`` the ego's centres projected on the path of its rig, which AlpaSim
+            takes instead of adding up the ego's steps.
+    """
+
+    def begun_with(column: F64, first: float, second: float) -> F64:
+        out = np.array(column)
+        out[:2] = np.array([first, second])[: len(out)]
+        return out
+
+    share = columns.share
+    corridor_m = columns.corridor_m
+    return RouteColumns(
+        distance_m=begun_with(columns.distance_m, 0.0, 0.0),
+        away_m=begun_with(columns.away_m, 0.0, 0.0),
+        share=begun_with(share, 0.0, share[2] / 2 if len(share) > 2 else 0.0),
+        so_far=begun_with(columns.so_far, 1.0, 1.0),
+        traveled_m=begun_with(along_own_path_m, 0.0, 0.0),
+        corridor_m=None if corridor_m is None else begun_with(corridor_m, 0.0, 0.0),
+    )
+
+
+def _alpasim_series(
+    drive: BesideRecording, columns: RouteColumns, length_m: float, preset: Preset
+) -> list[MetricSeries]:
+    """Give the metrics that only AlpaSim's presets have."""
+    out = []
+    if columns.corridor_m is not None and preset.stop_beyond_gt_m is not None:
+        has_left = columns.corridor_m >= preset.stop_beyond_gt_m
+        out = [
+            series("lateral_dist_to_gt_trajectory", drive.t_us, columns.corridor_m),
+            series("left_corridor_laterally", drive.t_us, has_left),
+        ]
+    share = columns.share
+    if preset.progress_of == "reachable" and length_m > 0:
+        reached_m = float(to_path(drive.path, drive.recorded[-1:])[1][0])
+        share = share * (length_m / reached_m if reached_m > 0 else 1.0)
+    return [*out, series("progress_rel_to_total", drive.t_us, share, length_m > 0, NO_LENGTH)]
 
 
 def lateral_bias(rollout: RolloutLog) -> MetricSeries:
