@@ -41,13 +41,13 @@ class _Collected:
     static_ids: set[str] = field(default_factory=set)
     counts: Counter[str] = field(default_factory=Counter)
     newer: list[str] = field(default_factory=list)
+    seed: int = 0
     info: dict[str, Any] = field(
         default_factory=lambda: {
             "empty_plans": 0,
             "terminated": False,
             "cameras": (),
             "other_cameras": (),
-            "seed": 0,
         }
     )
 
@@ -112,7 +112,7 @@ def _collect(got: _Collected, kind: str, entry: logging_pb2.LogEntry) -> None:
     elif kind == "driver_return":
         _driver_return(got, entry.driver_return)
     elif kind == "driver_session_request":
-        got.info["seed"] = entry.driver_session_request.random_seed
+        got.seed = entry.driver_session_request.random_seed
     elif kind == "traffic_session_request":
         objects = entry.traffic_session_request.logged_object_trajectories
         got.static_ids.update(one.object_id for one in objects if one.is_static)
@@ -155,54 +155,13 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> Non
 def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
     """Turn what was gathered into a `RolloutLog`."""
     path = got.path
-    if got.metadata is None:
-        raise _bad(path, "no rollout_metadata", "give a whole log")
-    metadata = got.metadata
-    session = got.metadata.session_metadata
-    definitions = metadata.actor_definitions.actor_aabb
-    if not definitions or definitions[0].actor_id != EGO:
-        first = definitions[0].actor_id if definitions else "nothing"
-        raise _bad(
-            path,
-            f"actor definitions begin with {first}",
-            f"define {EGO} first: its size is read from there",
-        )
-    if EGO not in got.poses:
-        raise _bad(
-            path,
-            f"no actor_poses of {EGO}",
-            "run the rollout again; nothing can be scored without them",
-        )
-    actors = {}
-    for definition in definitions[1:]:
-        poses = got.poses.get(definition.actor_id)
-        if poses:
-            i = definition.actor_id
-            track = _track(poses, f"{path}, poses of actor {i!r}")
-            actors[i] = Actor(
-                i,
-                definition.actor_label,
-                _box(definition.aabb, path, i),
-                track,
-                is_static=i in got.static_ids,
-            )
-    defined = {d.actor_id for d in definitions}
-    seed = got.info.pop("seed")
-    info = {
-        "entries": dict(got.counts),
-        "n_steps": session.n_sim_steps,
-        "unanswered": len(got.requests),
-        "undefined_actors": tuple(sorted(set(got.poses) - defined)),
-        "versions": {
-            f.name.removesuffix("_version"): v.version_id
-            for f, v in metadata.version_ids.ListFields()
-        },
-        **got.info,
-    }
+    metadata = _checked_metadata(got)
+    session = metadata.session_metadata
+    actors = _defined_actors(got, metadata)
     return RolloutLog(
         scene_id=session.scene_id,
         session_uuid=session.session_uuid,
-        ego_box=_box(definitions[0].aabb, path, EGO),
+        ego_box=_box(metadata.actor_definitions.actor_aabb[0].aabb, path, EGO),
         T_rig_box=read_transform(
             metadata.transform_ego_coords_rig_to_aabb, f"{path}, offset from rig to box"
         ),
@@ -217,10 +176,69 @@ def _assemble(got: _Collected, warnings: tuple[str, ...]) -> RolloutLog:
         render_start_us=session.render_start_timestamp_us,
         force_gt_us=metadata.force_gt_duration,
         control_us=session.control_timestep_us,
-        seed=seed,
-        info=info,
+        seed=got.seed,
+        info=_info(got, metadata),
         warnings=warnings,
     )
+
+
+def _checked_metadata(got: _Collected) -> logging_pb2.RolloutMetadata:
+    """Return the metadata of a log that defines the ego first, and has poses of it.
+
+    Raises:
+        InputError: It is not so.
+    """
+    if got.metadata is None:
+        raise _bad(got.path, "no rollout_metadata", "give a whole log")
+    definitions = got.metadata.actor_definitions.actor_aabb
+    if not definitions or definitions[0].actor_id != EGO:
+        first = definitions[0].actor_id if definitions else "nothing"
+        raise _bad(
+            got.path,
+            f"actor definitions begin with {first}",
+            f"define {EGO} first: its size is read from there",
+        )
+    if EGO not in got.poses:
+        raise _bad(
+            got.path,
+            f"no actor_poses of {EGO}",
+            "run the rollout again; nothing can be scored without them",
+        )
+    return got.metadata
+
+
+def _defined_actors(got: _Collected, metadata: logging_pb2.RolloutMetadata) -> dict[str, Actor]:
+    """Return the road users that the metadata define behind the ego, and that have poses."""
+    actors = {}
+    for definition in metadata.actor_definitions.actor_aabb[1:]:
+        actor_id = definition.actor_id
+        if actor_id not in got.poses:
+            continue
+        actors[actor_id] = Actor(
+            actor_id,
+            definition.actor_label,
+            _box(definition.aabb, got.path, actor_id),
+            _track(got.poses[actor_id], f"{got.path}, poses of actor {actor_id!r}"),
+            is_static=actor_id in got.static_ids,
+        )
+    return actors
+
+
+def _info(got: _Collected, metadata: logging_pb2.RolloutMetadata) -> dict[str, Any]:
+    """Return ``info`` of a log, see `read_asl`."""
+    defined = {definition.actor_id for definition in metadata.actor_definitions.actor_aabb}
+    versions = {
+        member.name.removesuffix("_version"): version.version_id
+        for member, version in metadata.version_ids.ListFields()
+    }
+    return {
+        "entries": dict(got.counts),
+        "n_steps": metadata.session_metadata.n_sim_steps,
+        "unanswered": len(got.requests),
+        "undefined_actors": tuple(sorted(set(got.poses) - defined)),
+        "versions": versions,
+        **got.info,
+    }
 
 
 def _track(poses: list[tuple[int, common_pb2.Pose]], location: str) -> Trajectory:
