@@ -63,23 +63,8 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
             it was driven with a part that is neither installed nor named.
     """
     row = named_rollout(Run.read(root).rollouts, name)
-    if not row.ok:
-        raise InputError(
-            f"{name}: the rollout did not finish: {row.failure}", "Name a finished rollout."
-        )
+    manifest = _finished_manifest(root, name, row)
     info = read_run_json(root)
-    state = inspect_rollout(root, row.path, full=True)
-    if state.damage or state.manifest is None:
-        raise InputError(
-            f"{name}: {'; '.join(f'{one.file}: {one.problem}' for one in state.damage) or 'unfinished'}",
-            "Give the command of the run again: it drives this rollout.",
-        )
-    manifest = state.manifest
-    if manifest.fork is not None:
-        raise InputError(
-            f"{name}: it is the continuation of another rollout",
-            f"name that rollout: {manifest.fork.of}",
-        )
     stated = info.scenes.get(row.scene)
     if stated is None or stated.ref is None or not isinstance(info.config, RunConfig):
         raise InputError(
@@ -90,26 +75,55 @@ def find_rollout(root: Path, name: str, named: Collection[str | None] = ()) -> L
     options = replace(options_of(info.config), baseline=None, video="none")
     own_parts = (row.renderer, row.policy, ref.source, options.controller)
     require_installed([*own_parts, *options.evaluators], root / RUN_INFO, named)
-    # Fixer settings may belong to another renderer of the run; a plan refuses settings without a
-    # fixer.
-    has_fixer = resolve_renderer(row.renderer, options.fixer).fixer is not None
-    rollout_options = replace(
-        options, fixer=overrides_of(row.renderer, options.fixer) if has_fixer else ()
+    plan = make_plan(
+        [ref], [row.renderer], [row.policy], [row.seed], _with_own_settings(options, row.renderer)
     )
-    plan = make_plan([ref], [row.renderer], [row.policy], [row.seed], rollout_options)
     (cell,) = plan.cells
-    loaded = plan.scenarios.get(row.scene)
+    scenario = plan.scenarios.get(row.scene)
     difference = ""
     if cell.rollout_key != manifest.rollout_key:
         difference = "content key differs"
-    if loaded is None:
+    if scenario is None:
         difference = f"scenario {ref.path} now has the scene id {cell.scene!r}"
-    if loaded is None or difference:
+    if scenario is None or difference:
         raise InputError(
             f"{name}: {difference}: the scenario, a part or the version has changed since the log was written",
             "Run the rollout again.",
         )
-    return LoggedRollout(root, cell, options, loaded, manifest)
+    return LoggedRollout(root, cell, options, scenario, manifest)
+
+
+def _finished_manifest(root: Path, name: str, row: Rollout) -> Manifest:
+    """Return the manifest of a rollout that is whole, and no continuation of another one.
+
+    Raises:
+        InputError: It is not so.
+    """
+    if not row.ok:
+        raise InputError(
+            f"{name}: the rollout did not finish: {row.failure}", "Name a finished rollout."
+        )
+    state = inspect_rollout(root, row.path, full=True)
+    if state.damage or state.manifest is None:
+        problems = "; ".join(f"{damage.file}: {damage.problem}" for damage in state.damage)
+        raise InputError(
+            f"{name}: {problems or 'unfinished'}",
+            "Give the command of the run again: it drives this rollout.",
+        )
+    if state.manifest.fork is not None:
+        raise InputError(
+            f"{name}: it is the continuation of another rollout",
+            f"name that rollout: {state.manifest.fork.of}",
+        )
+    return state.manifest
+
+
+def _with_own_settings(options: RunOptions, renderer: str) -> RunOptions:
+    """Return the options with those settings of fixers that are for a renderer: others may belong
+    to another renderer of the run, and a plan refuses settings without a fixer.
+    """
+    has_fixer = resolve_renderer(renderer, options.fixer).fixer is not None
+    return replace(options, fixer=overrides_of(renderer, options.fixer) if has_fixer else ())
 
 
 def named_rollout(rollouts: Sequence[Rollout], name: str) -> Rollout:

@@ -2,10 +2,8 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from alpasim_plugin import __version__
 from alpasim_plugin.core.errors import EvaluatorError, InputError
@@ -40,6 +38,7 @@ from alpasim_plugin.runs.score_logs import KnownScenes, LogScore, exit_code, sco
 from alpasim_plugin.runs.summary import pool_of
 from evaluators.alpasim import (
     EvalSettings,
+    ReducedRollout,
     SceneScore,
     metrics_results_table,
     metrics_unprocessed_table,
@@ -110,15 +109,8 @@ def execute_score(
     key = digest(facts)[:12]
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
-        held: RunInfo | None = None
-        with suppress(InputError):  # a damaged run.json is written again
-            held = read_run_json(root)
-        if held is not None and held.key != key:
-            raise InputError(
-                f"{root}: the folder holds other results (key {held.key})",
-                "Name another --out.",
-            )
-        changes = changed_evaluators({} if held is None else held.parts, evaluators)
+        earlier = _earlier_results(root, key)
+        changes = changed_evaluators({} if earlier is None else earlier.parts, evaluators)
         if changes:
             noticed(f"scored again: {some_of(changes)}")
         unfinish(root)
@@ -127,7 +119,7 @@ def execute_score(
         error: EvaluatorError | None = None
         if settings is not None:
             aggregation, error = _aggregate(scores, preset, settings, root / AGGREGATE)
-        manifests = [one.manifest for one in scores]
+        manifests = [log_score.manifest for log_score in scores]
         for manifest in manifests:
             write_manifest(root / manifest.path, manifest)
         used = _write_scenes(root, scores, scenes)
@@ -141,6 +133,25 @@ def execute_score(
     return ScoreResult(root, summary, code)
 
 
+def _earlier_results(root: Path, key: str) -> RunInfo | None:
+    """Return ``run.json`` of a folder into which the same logs were scored before; None where there
+    is none, or a damaged one, which is written again.
+
+    Raises:
+        InputError: The folder holds other results.
+    """
+    try:
+        info = read_run_json(root)
+    except InputError:
+        return None
+    if info.key != key:
+        raise InputError(
+            f"{root}: the folder holds other results (key {info.key})",
+            "Name another --out.",
+        )
+    return info
+
+
 def _aggregate(
     scores: Sequence[LogScore], preset: Preset, settings: EvalSettings, folder: Path
 ) -> tuple[JsonObject, EvaluatorError | None]:
@@ -148,36 +159,22 @@ def _aggregate(
 
     An error of the scene score leaves the values of the rollouts.
     """
-    good = [log_score.manifest for log_score in scores if log_score.scored is not None]
-    has_images = any(manifest.frames for manifest in good)
+    finished = [log_score for log_score in scores if log_score.scored is not None]
     failed = [log_score.manifest for log_score in scores if log_score.scored is None]
-    reduced = []
-    marks: dict[int, SceneScore] | None = {}
+    has_images = any(log_score.manifest.frames for log_score in finished)
+    reduced: list[ReducedRollout] = []
+    marks: dict[int, SceneScore] | None = None
     error: EvaluatorError | None = None
     try:
         if has_images:
-            scored = [log_score.scored for log_score in scores if log_score.scored is not None]
+            scored = [log_score.scored for log_score in finished if log_score.scored is not None]
             reduced = reduce_run(scored, preset)
-        marks = {
-            number: scene_score(rollout.values, settings.scene_score)
-            for number, rollout in enumerate(reduced)
-            if settings.scene_score.enabled and not rollout.dropped
-        }
+        marks = _marks(reduced, settings)
     except EvaluatorError as caught:
         error = caught
-        marks = None
-    finished = [log_score for log_score in scores if log_score.scored is not None]
     for number, (log_score, rollout) in enumerate(zip(finished, reduced, strict=False)):
-        values = dict(rollout.reduction.values)
-        mark = (marks or {}).get(number)
-        if mark is not None:
-            metric = METRICS["scene_score"]
-            values["scene_score"] = MetricValue(mark.score, True, "", metric.unit, metric.direction)
-        log_score.manifest = replace(
-            log_score.manifest,
-            metrics=values,
-            scene_score=None if mark is None else records.SceneScore(mark.failure_reason),
-        )
+        mark = None if marks is None else marks.get(number)
+        log_score.manifest = _with_values(log_score.manifest, rollout, mark)
     facts: JsonObject = {
         "folder": AGGREGATE,
         "files": [],
@@ -189,16 +186,42 @@ def _aggregate(
             f"{len(failed)} of {len(scores)} rollouts failed, and "
             "allow_aggregation_with_failed_rollouts is false"
         )
-    elif good and not has_images:
+    elif finished and not has_images:
         facts["skipped"] = "no log has an image, and its aggregation asks whether images are black"
     elif reduced:
         facts["files"] = _write_aggregate(folder, reduced, marks, failed, settings)
     return facts, error
 
 
+def _marks(reduced: Sequence[ReducedRollout], settings: EvalSettings) -> dict[int, SceneScore]:
+    """Return the scene scores of the rollouts that count, by index; none where scores are off.
+
+    Raises:
+        EvaluatorError: A metric that the score needs is missing.
+    """
+    if not settings.scene_score.enabled:
+        return {}
+    return {
+        number: scene_score(rollout.values, settings.scene_score)
+        for number, rollout in enumerate(reduced)
+        if not rollout.dropped
+    }
+
+
+def _with_values(manifest: Manifest, rollout: ReducedRollout, mark: SceneScore | None) -> Manifest:
+    """Return a manifest with the values that AlpaSim gives a rollout, its scene score among them."""
+    values = dict(rollout.reduction.values)
+    if mark is None:
+        return replace(manifest, metrics=values, scene_score=None)
+    metric = METRICS["scene_score"]
+    values["scene_score"] = MetricValue(mark.score, True, "", metric.unit, metric.direction)
+    scene_facts = records.SceneScore(mark.failure_reason)
+    return replace(manifest, metrics=values, scene_score=scene_facts)
+
+
 def _write_aggregate(
     folder: Path,
-    reduced: Sequence[Any],
+    reduced: Sequence[ReducedRollout],
     marks: dict[int, SceneScore] | None,
     failed: Sequence[Manifest],
     settings: EvalSettings,

@@ -129,7 +129,30 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
     Raises:
         InputError: Two rollouts of a scene have the same name.
     """
-    # Each rollout's rank among the names of its scene, dropped ones included.
+    by_rank: dict[int, list[dict[str, float | None]]] = {}
+    for rank, rollout in zip(_ranks(rollouts), rollouts, strict=True):
+        if not rollout.dropped:
+            by_rank.setdefault(rank, []).append(rollout.values)
+    if not by_rank:
+        return {}
+    rows = [_sweep(by_rank[rank]) for rank in sorted(by_rank)]
+    out: dict[str, float | int | None] = {}
+    spread: dict[str, float | int | None] = {}
+    for name in dict.fromkeys(name for row in rows for name in row):
+        column = _column(rows, name)
+        with np.errstate(invalid="ignore"):  # the spread of inf is NaN, as in AlpaSim's table
+            out[name] = float(np.mean(column)) if len(column) else None
+            spread[f"{name}_std"] = float(np.std(column, ddof=1)) if len(column) > 1 else None
+    return {**out, **spread, "n_rollouts": len(rows)}
+
+
+def _ranks(rollouts: Sequence[ReducedRollout]) -> list[int]:
+    """Return the rank of each rollout among the names of its scene, dropped ones included: rollouts
+    of one rank are a sweep.
+
+    Raises:
+        InputError: Two rollouts of a scene have the same name.
+    """
     names: dict[str, list[str]] = {}
     for rollout in rollouts:
         names.setdefault(rollout.scored.scene, []).append(rollout.scored.rollout)
@@ -141,26 +164,7 @@ def over_sweeps(rollouts: Sequence[ReducedRollout]) -> dict[str, float | int | N
                 "score the runs apart, or rename the folder of one log",
             )
         scene_rollouts.sort()
-    ranks = [names[rollout.scored.scene].index(rollout.scored.rollout) for rollout in rollouts]
-    kept = [
-        (rank, rollout.values)
-        for rank, rollout in zip(ranks, rollouts, strict=True)
-        if not rollout.dropped
-    ]
-    if not kept:
-        return {}
-    sweeps = [
-        [values for rank, values in kept if rank == r] for r in sorted({rank for rank, _ in kept})
-    ]
-    rows = [_sweep(sweep) for sweep in sweeps]
-    out: dict[str, float | int | None] = {}
-    spread: dict[str, float | int | None] = {}
-    for name in dict.fromkeys(name for row in rows for name in row):
-        column = _column(rows, name)
-        with np.errstate(invalid="ignore"):  # the spread of inf is NaN, as in AlpaSim's table
-            out[name] = float(np.mean(column)) if len(column) else None
-            spread[f"{name}_std"] = float(np.std(column, ddof=1)) if len(column) > 1 else None
-    return {**out, **spread, "n_rollouts": len(rows)}
+    return [names[rollout.scored.scene].index(rollout.scored.rollout) for rollout in rollouts]
 
 
 def _column(rows: Sequence[Mapping[str, float | None]], name: str) -> F64:
@@ -320,52 +324,59 @@ def results_summary(
         settings: Of the scene score.
     """
     run_uuid = combined_run_uuid([rollout.scored for rollout in rollouts])
-    later = any("left_corridor_laterally" in rollout.values for rollout in rollouts)
-    score_metrics = LATER_SCORE_METRICS if later else SCORE_METRICS
+    is_later = any("left_corridor_laterally" in rollout.values for rollout in rollouts)
+    score_metrics = LATER_SCORE_METRICS if is_later else SCORE_METRICS
     counted = [(i, rollout) for i, rollout in enumerate(rollouts) if not rollout.dropped]
+    counted.sort(key=lambda item: (item[1].scored.scene, item[1].scored.rollout))
     entries = [
-        _entry(rollout, scores.get(i), run_uuid, score_metrics)
-        for i, rollout in sorted(
-            counted, key=lambda item: (item[1].scored.scene, item[1].scored.rollout)
-        )
+        *(_entry(rollout, scores.get(i), run_uuid, score_metrics) for i, rollout in counted),
+        *(_failed_entry(failure, settings.enabled, score_metrics) for failure in failed),
     ]
-    for failure in failed:
-        ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
-        error = failure.get("error")
-        entry = ids | {
-            "status": "fail",
-            "passed": False,
-            "failure_reason": error,
-            "metrics": ids | {"error": error},
-        }
-        if settings.enabled:
-            entry |= {
-                "score": 0.0,
-                "score_metrics": {
-                    name: 0.0 if name == "progress_score" else None for name in score_metrics
-                },
-            }
-        entries.append(entry)
-    name = rollouts[0].scored.run_name if rollouts else None
-    saturation = settings.progress_saturation_threshold
-    least = settings.min_gt_distance_for_full_score_m
     overall: JsonObject = {key: _number(value) for key, value in sweeps.items()}
+    overall["run_uuid"] = run_uuid
+    overall["run_name"] = rollouts[0].scored.run_name if rollouts else None
     out: JsonObject = {
         "schema_version": SCHEMA_VERSION,
         "scene_score_enabled": settings.enabled,
         "rollouts": entries,
-        "metrics_results": [overall | {"run_uuid": run_uuid, "run_name": name}] if sweeps else [],
+        "metrics_results": [overall] if sweeps else [],
     }
     if settings.enabled:
-        out["score_criteria"] = {
-            "collision_at_fault": "== 0",
-            "offroad": "== 0",
-            "progress_score": f"min(clamp(progress_clipped_rel, 0, 1) / {saturation}, 1.0)",
-            "short_gt_distance_override": f"progress_score = 1.0 when gt_dist_traveled_m < {least}",
-        }
-        if later:
-            out["score_criteria"]["left_corridor_laterally"] = "== 0"
+        out["score_criteria"] = _criteria(settings, is_later)
     return out
+
+
+def _failed_entry(failure: JsonView, is_scored: bool, score_metrics: Sequence[str]) -> JsonObject:
+    """Return the entry of a rollout that failed; its score is 0 where scenes have scores."""
+    ids = {key: failure.get(key) for key in ("run_uuid", "run_name", "clipgt_id", "rollout_id")}
+    error = failure.get("error")
+    entry: JsonObject = ids | {
+        "status": "fail",
+        "passed": False,
+        "failure_reason": error,
+        "metrics": ids | {"error": error},
+    }
+    if is_scored:
+        entry["score"] = 0.0
+        entry["score_metrics"] = dict.fromkeys(score_metrics) | {"progress_score": 0.0}
+    return entry
+
+
+def _criteria(settings: SceneScoreSettings, is_later: bool) -> JsonObject:
+    """Return in words by what a scene is scored; ``is_later``: by AlpaSim's rules from commit
+    6f1029c on.
+    """
+    saturation = settings.progress_saturation_threshold
+    least_m = settings.min_gt_distance_for_full_score_m
+    criteria = {
+        "collision_at_fault": "== 0",
+        "offroad": "== 0",
+        "progress_score": f"min(clamp(progress_clipped_rel, 0, 1) / {saturation}, 1.0)",
+        "short_gt_distance_override": f"progress_score = 1.0 when gt_dist_traveled_m < {least_m}",
+    }
+    if is_later:
+        criteria["left_corridor_laterally"] = "== 0"
+    return criteria
 
 
 def _entry(
