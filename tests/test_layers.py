@@ -8,6 +8,7 @@ import re
 import pytest
 
 from tests.source_modules import PACKAGES, modules
+from tests.statistics_imports import computing_imports
 
 A = "alpasim_plugin."
 
@@ -249,3 +250,38 @@ def test_no_room_names_a_module_of_a_later_room_in_a_string():
             if room_of(name) not in allowed
         ]
     assert wrong == []
+
+
+# Verb -> what it calls that makes a result, and no other verb or server calls. All else is made by
+# `runs`, and stored.
+MAKERS = {
+    "check": {"reduce_rollout"},  # whether a log that is driven again has the same outcome
+    "compare": {"Comparison", "compare_runs", "compare_within"},
+    "gate": {
+        "Baseline",
+        "GateSpec",
+        "boundary_verdict",
+        "check_gate",
+        "check_matches",
+        "check_number_of_scenes",
+        "is_repeatable",
+        "load_gate",
+        "read_baseline",
+        "table_of_run",
+        "write_baseline",
+    },
+    # The question that a run drives until it is decided, and whether a baseline is one of its own.
+    "run": {"Question", "base_named", "load_gate", "metric_question", "variants_of"},
+    "score": {"worst_code"},  # of several presets
+}
+
+
+def test_a_verb_makes_no_result_beside_its_own():
+    """Terminal, page and file say the same where one of them made it."""
+    rooms = tuple(A + room for room in ("alpasim", "gym", "cli"))
+    imports = {
+        module.name.rsplit(".", 1)[-1]: computing_imports(module.nodes)
+        for module in modules()
+        if room_of(module.name) in rooms
+    }
+    assert {name: {*made} for name, made in imports.items() if made} == MAKERS
