@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -68,48 +69,46 @@ def finetune_decoder(
     vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
     net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
 
-    def tell(subject: str) -> Callable[[int, int], None] | None:
-        return None if prepared is None else lambda done, count: prepared(subject, done, count)
-
-    clips = LatentClips(
-        PairDataset(data, "train", size).sequences,
-        vae,
-        form,
-        out.parent / "latents",
-        tell("latents"),
-    )
-    map_kind = "drawn" if settings.uses_map else settings.no_map
+    sequences = PairDataset(data, "train", size).sequences
+    clips = LatentClips(sequences, vae, form, out.parent / "latents", _named(prepared, "latents"))
     rollouts = Rollouts(
         clips,
         vae,
         net,
         settings.block_latents,
         settings.window,
-        map_kind,
+        "drawn" if settings.uses_map else settings.no_map,
         out.parent / "rollouts",
-        tell("rollouts"),
+        _named(prepared, "rollouts"),
     )
     task = DecoderTask(vae, rollouts, recipe, distance)
     facts = {**task.facts, "init": file_sha256(bundle)}
     vae.to(require_device(device))
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)
-    path = out / BUNDLE_FILE
     made: dict[str, dict[str, Tensor]] = {
         "dit": {key: half(value) for key, value in parts["dit"].items()},
         "vae": {key: half(value) for key, value in trainer.averaged().items()},
     }
     note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
+    path = out / BUNDLE_FILE
     save_bundle(path, made, settings, trained=True, note=note)
-    rows, hours = curves(out / LOG_FILE)
     about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
     training = {
         "what": "decoder only, on the generator's rollouts",
         "schedule": asdict(schedule),
         **facts,
     }
+    rows, hours = curves(out / LOG_FILE)
     ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
     return path
+
+
+def _named(
+    prepared: Callable[[str, int, int], None] | None, subject: str
+) -> Callable[[int, int], None] | None:
+    """Return a report of what is prepared that says what it is."""
+    return None if prepared is None else partial(prepared, subject)
 
 
 def bundle_settings(bundle: Path) -> OneFixerSettings:

@@ -224,21 +224,7 @@ def train_stage(
     for name, parameter in task.parts.named_parameters():
         parameter.requires_grad_(any(f"{name}.".startswith(f"{part}.") for part in stage.trained))
     schedule = run.schedule_of(stage)
-    facts = {
-        **task.facts,
-        "recipe": run.recipe.name,
-        "stage": stage.name,
-        "clips": len(clips),
-        "latents": clips.digest,
-        "batches": asdict(inputs.form),
-        "equal_channels": run.equal_channels,
-        "seen": asdict(stage.conditioning),
-        "attention": asdict(inputs.attention),
-        "distance": distance[0] if distance else "none",
-        "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
-        "vae": file_sha256(run.vae),
-        "precision": str(run.precision_of(stage)),
-    }
+    facts = {**task.facts, **_stage_facts(run, stage, clips, inputs, distance)}
     task.parts.to(require_device(run.device))
     trainer = Trainer(
         task.parts,
@@ -254,6 +240,30 @@ def train_stage(
         return folder / BUNDLE_FILE
     trainer.run(report, until)
     return write_bundle(run, stage, folder, trainer.averaged(), facts, trainer.step, schedule)
+
+
+def _stage_facts(
+    run: FixerRun,
+    stage: Stage,
+    clips: LatentClips,
+    inputs: StageInputs,
+    distance: tuple[str, Distance] | None,
+) -> dict[str, Any]:
+    """Return what identifies a stage beside its task: a folder of another one is refused."""
+    return {
+        "recipe": run.recipe.name,
+        "stage": stage.name,
+        "clips": len(clips),
+        "latents": clips.digest,
+        "batches": asdict(inputs.form),
+        "equal_channels": run.equal_channels,
+        "seen": asdict(stage.conditioning),
+        "attention": asdict(inputs.attention),
+        "distance": distance[0] if distance else "none",
+        "start": {part: _digest(inputs.weights.get(part)) for part in stage.start},
+        "vae": file_sha256(run.vae),
+        "precision": str(run.precision_of(stage)),
+    }
 
 
 def clip_latents(run: FixerRun, stage: Stage) -> int:

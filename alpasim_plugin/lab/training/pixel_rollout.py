@@ -164,50 +164,86 @@ def pixel_losses(
     flow = zero
     choice = zero
     for i in range(frames):
-        render = sample.render[:, i]
-        opacity = sample.opacity[:, i]
-        truth = sample.truth[:, i]
-        references = None if sample.references is None else sample.references[:, i]
-        sdmap = sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0)
+        frame = _frame(sample, i, objectives)
         if objectives.flow and i == sample.flow_frame:
-            source = _source(render, opacity, sample.eps_flow, objectives)
-            t = sample.t[:, None, None, None]
-            guess, _ = net(
-                render,
-                opacity,
-                sdmap,
-                detached(state),
-                interpolant(truth, source, t),
-                sample.t,
-                references,
-            )
-            flow = ((guess - truth).abs() / t.clamp(min=EARLIEST)).mean()
+            flow = _flow_term(net, frame, detached(state), sample, objectives)
         if i and i % objectives.horizon == 0:
             state = detached(state)
         before = state
-        source = _source(render, opacity, sample.eps[:, i], objectives)
+        source = _source(frame.render, frame.opacity, sample.eps[:, i], objectives)
         with torch.set_grad_enabled(objectives.in_pixels):
             out, state, sources = with_sources(
-                net, render, opacity, sdmap, before, source, references
+                net, frame.render, frame.opacity, frame.sdmap, before, source, frame.references
             )
         outputs.append(out)
         if objectives.choice and sources is not None:
-            choice = choice + choice_term(sources, truth) / frames
+            choice = choice + choice_term(sources, frame.truth) / frames
         if objectives.history == "clean":
-            state = state._replace(output=truth)
+            state = state._replace(output=frame.truth)
         elif objectives.history == "redenoised":
-            t = sample.t_history[:, i]
             with torch.no_grad():
-                _, state = net(
-                    render,
-                    opacity,
-                    sdmap,
-                    before,
-                    interpolant(truth, source, t[:, None, None, None]),
-                    t,
-                    references,
-                )
+                _, state = _denoised(net, frame, before, source, sample.t_history[:, i])
     made = torch.stack(outputs, dim=1)
+    return _weighed(made, sample, flow, choice, detached(state), objectives, distance)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame of a sample, as the generator and the terms see it; see `PixelSample`."""
+
+    render: Tensor
+    opacity: Tensor
+    sdmap: Tensor
+    references: Tensor | None
+    truth: Tensor
+
+
+def _frame(sample: PixelSample, i: int, objectives: PixelObjectives) -> _Frame:
+    """Return frame i of a sample."""
+    render = sample.render[:, i]
+    return _Frame(
+        render=render,
+        opacity=sample.opacity[:, i],
+        sdmap=sample.sdmap[:, i] if objectives.use_map else torch.full_like(render, -1.0),
+        references=None if sample.references is None else sample.references[:, i],
+        truth=sample.truth[:, i],
+    )
+
+
+def _denoised(
+    net: PixelGenerator, frame: _Frame, state: PixelState, source: Tensor, t: Tensor
+) -> tuple[Tensor, PixelState]:
+    """Noise the truth of a frame up to times ``t`` ``(B,)``, and let the generator clean it."""
+    noisy = interpolant(frame.truth, source, t[:, None, None, None])
+    return net(frame.render, frame.opacity, frame.sdmap, state, noisy, t, frame.references)
+
+
+def _flow_term(
+    net: PixelGenerator,
+    frame: _Frame,
+    state: PixelState,
+    sample: PixelSample,
+    objectives: PixelObjectives,
+) -> Tensor:
+    """Return the flow term of a frame."""
+    source = _source(frame.render, frame.opacity, sample.eps_flow, objectives)
+    guess, _ = _denoised(net, frame, state, source, sample.t)
+    t = sample.t[:, None, None, None]
+    return ((guess - frame.truth).abs() / t.clamp(min=EARLIEST)).mean()
+
+
+def _weighed(
+    made: Tensor,
+    sample: PixelSample,
+    flow: Tensor,
+    choice: Tensor,
+    state: PixelState,
+    objectives: PixelObjectives,
+    distance: Distance | None,
+) -> PixelLosses:
+    """Return the terms on the frames that were made, ``(B, T, H, W, 3)``, and their weighted sum."""
+    zero = sample.render.new_zeros(())
+    frames = made.shape[1]
     weight = _pixel_weights(sample)
     picture = (weight * (made - sample.truth).abs()).mean()
     moved = (made[:, 1:] - made[:, :-1]) - (sample.truth[:, 1:] - sample.truth[:, :-1])
@@ -222,9 +258,7 @@ def pixel_losses(
         + objectives.temporal * temporal
     )
     total = total + objectives.grid * grid + objectives.flow * flow + objectives.choice * choice
-    return PixelLosses(
-        total, picture, perceptual, temporal, flow, grid, choice, made, detached(state)
-    )
+    return PixelLosses(total, picture, perceptual, temporal, flow, grid, choice, made, state)
 
 
 def _pixel_weights(sample: PixelSample) -> Tensor:
