@@ -159,41 +159,72 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
         (True, torch.Size([1, 2]))
     """
-    if compositor is None:
-        with torch.no_grad():
-            index = _candidates(splats, camera, near_m)
-        candidates = Splats(*(tensor.index_select(0, index) for tensor in splats))
-        local = _in_camera(candidates.means, camera)
-    else:
-        candidates = splats
-        local = _in_camera(splats.means, camera)
-        visible = _is_drawn(local, splats, near_m)
-        index = torch.arange(len(visible), device=visible.device)
-        # What is behind the camera has no projection: its gradient would be 0 times infinity.
-        local = torch.where(visible, local, 1.0)
-    uv, m, n = _ellipses(local, candidates, camera)
+    candidates = _candidates_of(splats, camera, near_m, all_of_them=compositor is not None)
+    local = candidates.local
+    uv, m, n = _ellipses(local, candidates.splats, camera)
     if uv.requires_grad:
         uv.retain_grad()
-    log_opacity = torch.nn.functional.logsigmoid(candidates.logit_opacities)
-    projected = (uv, m, n, log_opacity, _colours(local, candidates.sh, camera), local[2])
+    log_opacity = torch.nn.functional.logsigmoid(candidates.splats.logit_opacities)
+    colours = _colours(local, candidates.splats.sh, camera)
+    projected = (uv, m, n, log_opacity, colours, local[2])
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
         records = _records(*projected, scale)
-        centre = records[:, U : V + 1]
-        reach = records[:, RADIUS_X : RADIUS_Y + 1]
-        last = upload([camera.width - 0.5, camera.height - 0.5], records.device)
-        on_screen = ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
+        on_screen = candidates.is_drawn & _reaches_the_image(records, camera)
         if compositor is None:
             images, sums, pairs = _on_cpu(records, camera, thread_count(threads))
         else:
-            on_screen &= visible
             images, sums, pairs = _on_gpu(records, log_opacity, on_screen, camera, compositor)
     colour_sum, alpha, depth_sum = _Composite.apply(*projected, images, sums, scale)  # type: ignore[no-untyped-call]
     rgb = colour_sum
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
-    return GradientOutput(rgb, alpha, depth, index, uv, on_screen, pairs)
+    return GradientOutput(rgb, alpha, depth, candidates.index, uv, on_screen, pairs)
+
+
+@dataclass(frozen=True)
+class _CandidateSplats:
+    """Splats that may reach the image.
+
+    Attributes:
+        index: ``(M,)`` which of all splats they are.
+        splats: The ``M`` splats.
+        local: ``(3, M)`` their centres in the camera.
+        is_drawn: ``(M,)`` bool; the others have no part in the image.
+    """
+
+    index: Tensor
+    splats: Splats
+    local: Tensor
+    is_drawn: Tensor
+
+
+def _candidates_of(
+    splats: Splats, camera: PinholeCamera, near_m: float, all_of_them: bool
+) -> _CandidateSplats:
+    """Return the splats that may reach the image, nearest first; or all of them with what says
+    which are drawn, where the host must not wait for their number.
+    """
+    if not all_of_them:
+        with torch.no_grad():
+            index = _indices_in_view(splats, camera, near_m)
+        chosen = Splats(*(tensor.index_select(0, index) for tensor in splats))
+        is_drawn = torch.ones_like(index, dtype=torch.bool)
+        return _CandidateSplats(index, chosen, _in_camera(chosen.means, camera), is_drawn)
+    local = _in_camera(splats.means, camera)
+    is_drawn = _is_drawn(local, splats, near_m)
+    index = torch.arange(len(is_drawn), device=is_drawn.device)
+    # What is behind the camera has no projection: its gradient would be 0 times infinity.
+    return _CandidateSplats(index, splats, torch.where(is_drawn, local, 1.0), is_drawn)
+
+
+def _reaches_the_image(records: Tensor, camera: PinholeCamera) -> Tensor:
+    """Return ``(M,)`` whether the box around a projected splat meets the middle of a pixel."""
+    centre = records[:, U : V + 1]
+    reach = records[:, RADIUS_X : RADIUS_Y + 1]
+    last = upload([camera.width - 0.5, camera.height - 0.5], records.device)
+    return ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
 
 
 def _colours(local: Tensor, sh: Tensor, camera: PinholeCamera) -> Tensor:
@@ -237,7 +268,7 @@ def rasterize_torch(
     return RasterOutput(out.rgb.clamp(0, 1).numpy(), out.alpha.numpy(), out.depth.numpy())
 
 
-def _candidates(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
+def _indices_in_view(splats: Splats, camera: PinholeCamera, near_m: float) -> Tensor:
     """Return the Gaussians ``(M,)`` that can reach the image, nearest first; equal depths keep
     their order.
 
