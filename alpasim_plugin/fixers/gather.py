@@ -182,11 +182,6 @@ def _blend(
     """
     count, height, width = references.shape
     cells_down, cells_across = weight.shape[1:3]
-    unit = np.float32(1.0)
-    zero = np.float32(0.0)
-    largest = np.float32(LARGEST)
-    nowhere = np.float32(NOWHERE)
-    half = np.float32(0.5 / HALF)
     y0, y1, fy = _between(height, scale, DETAIL * cells_down)
     x0, x1, fx = _between(width, scale, DETAIL * cells_across)
     v0, v1, fv = _between(height, scale * DETAIL, cells_down)
@@ -208,17 +203,12 @@ def _blend(
     row_of[:] = -1
     for i in range(len(repaired)):
         y = first_row + i
-        total[:] = unit
-        for x in range(width):
-            for c in range(3):
-                blended[c, x] = repaired[i, x, c]
+        _begin_row(repaired[i], blended, total)
         for k in range(count):
             for row in (v0[y], v1[y]):
                 if row_of[k, row % 2] != row:
                     row_of[k, row % 2] = row
-                    for j in range(coarse_offset.shape[1]):
-                        for c in range(2):
-                            coarse_offset[c, j] = np.float32(scale) * offset_px[k, row, j, c]
+                    _offset_row(offset_px[k], row, scale, coarse_offset)
                     _stretched(coarse_offset, u0, u1, fu, offset_rows[k, row % 2])
             upper = offset_rows[k, v0[y] % 2]
             lower = offset_rows[k, v1[y] % 2]
@@ -231,17 +221,69 @@ def _blend(
                     _stretched(coarse_correction, x0, x1, fx, correction_rows[k, row % 2])
             upper = correction_rows[k, y0[y] % 2]
             lower = correction_rows[k, y1[y] % 2]
-            for x in range(width):
-                logarithm = upper[3, x] + fy[y] * (lower[3, x] - upper[3, x])
-                logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
-                share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), unit)
-                total[x] += share[x]
+            _weigh_row(upper, lower, fy[y], finer, i, k, looked_up, share, total)
             _add_row(upper, lower, fy[y], looked_up, share, blended)
-        for x in range(width):
-            over = unit / total[x]
-            for c in range(3):
-                out[i, x, c] = blended[c, x] * over
-            recorded[i, x, 0] = max(unit - over, zero)
+        _end_row(blended, total, out[i], recorded[i])
+
+
+@vector_kernel
+def _begin_row(repaired, blended, total):
+    """Begin a row of pixels with the repaired frame ``(W, 3)``, whose weight is 1.
+
+    Args:
+        repaired: ``(W, 3)``.
+        blended: ``(3, W)``, written.
+        total: ``(W,)`` sum of weights, written.
+    """
+    total[:] = np.float32(1.0)
+    for x in range(len(repaired)):
+        for c in range(3):
+            blended[c, x] = repaired[x, c]
+
+
+@vector_kernel
+def _end_row(blended, total, out, recorded):
+    """Divide a row of pixels by the sum of weights.
+
+    Args:
+        blended: ``(3, W)`` weighted sum.
+        total: ``(W,)`` sum of weights.
+        out: ``(W, 3)``, written.
+        recorded: ``(W, 1)``, written: the references' share of the weights.
+    """
+    unit = np.float32(1.0)
+    zero = np.float32(0.0)
+    for x in range(len(out)):
+        over = unit / total[x]
+        for c in range(3):
+            out[x, c] = blended[c, x] * over
+        recorded[x, 0] = max(unit - over, zero)
+
+
+@vector_kernel
+def _weigh_row(upper, lower, share_down, finer, i, k, looked_up, share, total):
+    """Weigh a row of pixels of a reference.
+
+    Args:
+        upper, lower: ``(CHANNELS, W)`` corrections of the coarser rows around; the last channel is
+            the logarithm of the weight.
+        share_down: The share of the lower one.
+        finer: ``(n, W, K)`` what is added to the logarithm in row ``i`` for reference ``k``; it may
+            be empty.
+        looked_up: ``(CHANNELS, W)``, see `_sample_row`; the last channel tells where it holds.
+        share: ``(W,)`` weight of the reference, written.
+        total: ``(W,)`` sum of weights, added to.
+    """
+    unit = np.float32(1.0)
+    zero = np.float32(0.0)
+    largest = np.float32(LARGEST)
+    nowhere = np.float32(NOWHERE)
+    half = np.float32(0.5 / HALF)
+    for x in range(len(share)):
+        logarithm = upper[3, x] + share_down * (lower[3, x] - upper[3, x])
+        logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
+        share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), unit)
+        total[x] += share[x]
 
 
 @vector_kernel
@@ -348,6 +390,16 @@ def _between(length, scale, count):
         after[x] = min(before[x] + 1, last)
         share[x] = place - before[x]
     return before, after, share
+
+
+@vector_kernel
+def _offset_row(offset_px, row, scale, out):
+    """Write the offsets ``(2, w)`` that a head gives for a row of cells, in pixels of an image that
+    is ``scale`` times finer.
+    """
+    for j in range(out.shape[1]):
+        for c in range(2):
+            out[c, j] = np.float32(scale) * offset_px[row, j, c]
 
 
 @kernel
