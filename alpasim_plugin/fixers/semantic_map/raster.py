@@ -214,8 +214,8 @@ def _draw_shape(shape, band_row, height, width, depth, colour):
             is_whole = b0 >= m0 and b1 >= m1 and b2 >= m2
             inverse = ix * xc + ir
             first = ((row - band_row) * width + column) * COUNT
-            at = (b0, b1, b2)
-            mask = _cover(shape, at, slopes, is_whole, inverse, ix, iy, first, depth)
+            barycentric = (b0, b1, b2)
+            mask = _cover(shape, barycentric, slopes, is_whole, inverse, ix, iy, first, depth)
             if mask == 0:
                 continue
             packed = _shaded(shape, inverse, sx * xc + sr)
@@ -249,13 +249,13 @@ def _columns_of_row(edges, x, yc, width):
 
 
 @inlined_kernel
-def _cover(shape, at, slopes, is_whole, inverse, ix, iy, first, depth):
+def _cover(shape, barycentric, slopes, is_whole, inverse, ix, iy, first, depth):
     """Write the depths of the samples of a pixel that a triangle covers and where nothing
     nearer is drawn, and return their mask.
 
     Args:
         shape: The triangle.
-        at: Barycentric coordinates of the pixel's middle.
+        barycentric: Coordinates of the pixel's middle.
         slopes: Their slopes, across and down in turn.
         is_whole: The triangle covers all samples.
         inverse: 1/depth at the middle.
@@ -263,7 +263,7 @@ def _cover(shape, at, slopes, is_whole, inverse, ix, iy, first, depth):
         first: Index of the first sample.
         depth: 1/depth of what the samples show, written.
     """
-    b0, b1, b2 = at
+    b0, b1, b2 = barycentric
     a0, c0, a1, c1, a2, c2 = slopes
     mask = 0
     for s in range(COUNT):
