@@ -18,7 +18,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import Direction
 from alpasim_plugin.log.run_folder.records import Pool, Repeat, RolloutError
 
-SCHEMA = 2  # of summary.json
+SCHEMA = 3  # of summary.json
 
 Bounds = tuple[float, float]  # [low, high]
 Verdict = Literal["non-inferior", "worse", "undecided"]
@@ -95,7 +95,8 @@ class Mean:
         n_invalid: Cells that ran to their end without a valid value.
         mean: Over cells; rates are fractions. None without a value.
         ci95: Half-width 1.96 s / sqrt(N) of the paper, as if rollouts were independent.
-        ci95_clustered: 95 % interval with scenes as clusters.
+        ci95_clustered: 95 % interval with scenes as clusters; None where nothing says how far a
+            scene that was not driven can lie.
         ci95_clustered_method: How that was made.
         n_events: Cells with the event; flags only.
         reason: Why there is no mean.
@@ -153,19 +154,20 @@ class CellCounts:
 
 @dataclass(frozen=True)
 class Beyond:
-    """What the difference of a distance does not count, because it lies beyond the metric's cap.
+    """Scenes of which a claim counts only its cap: an event of its own, about which the claim says
+    nothing.
 
     Attributes:
-        event: In words.
-        diff: Share of scenes with more of it, positive is worse.
-        at_most: Upper guarded bound of ``diff``.
-        margin: ``at_most`` must lie below it for a verdict of non-inferiority.
+        event: In words, with the cap.
+        n: Scenes with it.
+        n_scenes: Of so many.
+        at_most: Largest share of other scenes that may have it (exact, one-sided 95 %).
     """
 
     event: str
-    diff: float
+    n: int
+    n_scenes: int
     at_most: float
-    margin: float
 
 
 @dataclass(frozen=True)
@@ -199,11 +201,14 @@ class Difference:
         n_missing: Planned cells without a pair.
         missing: The first of these.
         diff: Mean over scenes of each scene's mean difference.
-        spread: Standard deviation of the difference between scenes.
-        ci95: 95 % interval, scenes as unit.
+        claim: What verdict and bounds are about: "mean" of what has bounds, else "mean cut at 4 m",
+            each scene's difference counted up to the metric's cap. None: nothing says how much a
+            scene that was not driven can differ, so that nothing is claimed of others.
+        cut_mean: The mean that the claim is about; None without a claim.
+        spread: Standard deviation between scenes of what the claim is about.
+        ci95: 95 % interval, scenes as unit; None without a claim.
         method: How that was made.
-        guarded: Bounds that a verdict must hold for as well: they allow for what these scenes did
-            not show. Without them nothing is decided.
+        guarded: Bounds of the claim: they allow for what these scenes did not show.
         p_value: Of the test of no difference, by itself.
         p_corrected: The same after Holm's correction for all differences that were tested together
             (`evaluators.statistics.verdicts.corrected`); verdict and difference go by it.
@@ -213,7 +218,7 @@ class Difference:
         more_scenes: The fewest more that would decide an undecided verdict.
         scenes: How many went which way.
         cells: The same of the cells of a flag.
-        beyond: Of a distance with a cap.
+        beyond: What lies beyond the cap of a claim.
         reason: Why numbers are None.
         note: What qualifies them.
     """
@@ -227,6 +232,8 @@ class Difference:
     n_missing: int = 0
     missing: tuple[MissingPair, ...] = ()
     diff: float | None = None
+    claim: str | None = None
+    cut_mean: float | None = None
     spread: float | None = None
     ci95: Bounds | None = None
     method: str | None = None
@@ -506,7 +513,7 @@ class Summary:
     alpasim: dict[str, Any] | None = None
     boundary: dict[str, Any] | None = None
     runs: tuple[str, ...] = ()
-    schema: Literal[2] = 2
+    schema: Literal[3] = 3
 
     @property
     def differences(self) -> list[tuple[str, dict[str, Difference]]]:

@@ -23,9 +23,9 @@ from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64
 from evaluators.metrics import METRICS
-from evaluators.statistics.betting import Draws, Plan, bet_sizes, log_capital
-from evaluators.statistics.bounded import mean_interval, upper_bound
-from evaluators.statistics.differences import difference_bounds, flag_interval
+from evaluators.statistics.bounded import mean_interval
+from evaluators.statistics.decision import Question, metric_question, state_after
+from evaluators.statistics.differences import difference_bounds, flag_interval, reach_of
 from evaluators.statistics.intervals import TAIL, exact_rate, paired_rate, t_interval
 from evaluators.statistics.noise import (
     CUT_MARGINS,
@@ -37,6 +37,7 @@ from evaluators.statistics.noise import (
 )
 from evaluators.statistics.power import size_table
 from evaluators.statistics.suite import LEVEL, flipped
+from evaluators.statistics.verdicts import verdict
 
 SIZES = ((3, 3), (6, 1), (14, 1), (42, 1), (14, 6))  # scenes, seeds
 
@@ -217,72 +218,97 @@ def joined_apart(new: int, gone: int, n: int) -> tuple[float, float]:
     return low, up - down + math.hypot(up_high - up, down - down_low)
 
 
+CLAIMS = (  # name, harms of scenes, the answer that may be wrong
+    ("0.5 % of scenes by 20 m", two_values(0.005, 20.0), "non-inferior"),
+    ("1 % of scenes by 15 m", two_values(0.01, 15.0), "non-inferior"),
+    ("2.5 % of scenes by 4 m", two_values(0.025, 4.0), "non-inferior"),
+    ("3 % of scenes by 20 m", two_values(0.03, 20.0), "non-inferior"),
+    ("3 % by 15 m, others better by 0.02 m", two_values(0.03, 15.0, -0.02), "non-inferior"),
+    ("half of scenes by 0.2 m", two_values(0.5, 0.2), "non-inferior"),
+    (
+        "2.5 % of scenes better by 20 m, others worse by 0.2 m",
+        two_values(0.025, -20.0, 0.2),
+        "worse",
+    ),
+    ("half of scenes worse by 0.2 m", two_values(0.5, 0.2), "worse"),
+)
+
+
 def claims_beyond_the_cap(effort: Effort) -> Iterator[Sequence[str]]:
-    """Give how often a claim about other scenes is `non-inferior`: of a distance, cut at its cap of
-    4 m, where a share of scenes goes far beyond it.
+    """Give how often a claim about other scenes is made: of a distance, whose mean is cut at 4 m,
+    where a share of scenes goes far beyond that; of a fixed number of scenes, and until decided.
     """
     metric = METRICS.info("lateral_distance_m")
     margin, cap = 0.1, metric.cap or 4.0
-    for share_far, far in ((0.005, 20.0), (0.01, 15.0), (0.025, 4.0), (0.03, 20.0)):
-        truth = share_far * min(far, cap)
-        row = [f"{100 * share_far:g} % of scenes by {far:g} m", f"{truth:.3f}"]
-        for n in (200, 400):
+    question = Question((metric_question(metric.name, margin),))
+    for name, draw, answer in CLAIMS:
+        rng = stream("calibration", 0, f"truth/{name}")
+        many = draw(rng, 2_000_000)
+        truth = float(np.mean(np.clip(many, -cap, cap)))
+        sign = 1.0 if answer == "non-inferior" else -1.0
+        is_wrong = sign * (truth - margin) >= -3e-3
+        row = [f"{name}: `{answer}`", f"{truth:.3f}", f"{np.mean(many):.3f}"]
+        for n in (20, 60, 200, 400):
             fixed, betting = [], []
             for number in range(min(effort.draws, 1_000)):
-                rng = stream("calibration", number, f"cap/{share_far}/{far}/{n}")
-                harms = np.where(rng.random(n) < share_far, far, 0.0)
-                capped = np.clip(harms, -cap, cap)
-                fixed.append(upper_bound(capped, cap) < margin)
+                rng = stream("calibration", number, f"cap/{name}/{n}")
+                harms = draw(rng, n)
+                _, bounds = difference_bounds(harms, harms, np.arange(n), metric, margin)
+                given = (
+                    None
+                    if bounds is None
+                    else verdict((bounds[0], bounds[1]), 0.0, margin, "lower")
+                )
+                fixed.append(given == answer)
                 if number < effort.flips:
-                    draws = Draws(-capped, cap)
-                    plan = Plan(margin, n, 0.05)
-                    capital = log_capital(draws, -margin, bet_sizes(draws, -margin, plan))
-                    betting.append(bool(np.max(capital) >= plan.log_bar))
-            word = " (wrong)" if truth >= margin else ""
-            row.append(f"{share(fixed)} / {share(betting)}{word}")
+                    state = state_after(question, {metric.name: harms}, n)
+                    betting.append(state.metrics[metric.name]["verdict"] == answer)
+            row.append(f"{share(fixed)} / {share(betting)}" + (" (wrong)" if is_wrong else ""))
         yield row
 
 
+PRINTED = (  # name, values of scenes, metric, whether they are differences
+    ("difference of a distance, 3 % of scenes by 3 m", two_values(0.03, 3.0), "lateral_distance_m", True),
+    ("a distance, 3 % of scenes 3 m", two_values(0.03, 3.0, 0.1), "lateral_distance_m", False),
+    ("difference of a rate, one family of ten by 80 points", two_values(0.1, 0.8), "offroad", True),
+    ("difference of `progress`, one family of ten by half", two_values(0.1, -0.5), "progress", True),
+    (
+        "difference of the distance to obstacles, 5 % by 20 m",
+        two_values(0.05, -20.0),
+        "min_distance_to_obstacle_m",
+        True,
+    ),
+    ("the distance to obstacles, 5 % 20 m", two_values(0.05, 20.0, 1.0), "min_distance_to_obstacle_m", False),
+    ("difference of a plan's deviation, 5 % by 3 m", two_values(0.05, 3.0), "plan_deviation", True),
+)  # fmt: skip
+
+
 def printed_intervals(effort: Effort) -> Iterator[Sequence[str]]:
-    """Give the coverage of printed intervals by t and by the rule in use, about the mean that the
-    rule names.
+    """Give the coverage of Student's interval about the mean, and of the printed one about what it
+    states: of differences without bounds, the mean that is cut.
     """
-    cases: list[tuple[str, Callable[[np.random.Generator, int], F64], str, bool]] = [
-        (
-            "difference of a distance, 3 % of scenes by 3 m",
-            two_values(0.03, 3.0),
-            "lateral_distance_m",
-            True,
-        ),
-        ("a distance, 3 % of scenes 3 m", two_values(0.03, 3.0, 0.1), "lateral_distance_m", False),
-        ("one family of ten by 80 points", two_values(0.1, 0.8), "offroad", True),
-        (
-            "difference of the distance to obstacles, 5 % by 20 m",
-            two_values(0.05, -20.0),
-            "min_distance_to_obstacle_m",
-            True,
-        ),
-    ]
-    for name, draw, metric_name, is_difference in cases:
+    for name, draw, metric_name, is_difference in PRINTED:
         metric = METRICS.info(metric_name)
         row = [name]
-        truth = float(np.mean(draw(stream("calibration", 0, f"truth/{name}"), 2_000_000)))
+        many = draw(stream("calibration", 0, f"truth/{name}"), 2_000_000)
+        truth = float(np.mean(many))
+        reach = reach_of(metric, metric.accepted)
+        claimed = float(np.mean(np.clip(many, -reach, reach))) if is_difference else truth
         for n in (3, 12, 20, 60):
-            plain, bounded = [], []
+            plain, printed = [], []
             for number in range(effort.draws):
                 rng = stream("calibration", number, f"printed/{name}/{n}")
                 values = draw(rng, n)
                 student = t_interval(values)
                 plain.append(student.low is not None and student.low <= truth <= student.high)
                 if is_difference:
-                    found, _ = difference_bounds(
-                        values, values, np.arange(n), metric, metric.accepted
-                    )
+                    places = np.arange(n)
+                    interval, _ = difference_bounds(values, values, places, metric, metric.accepted)
                 else:
-                    found = mean_interval(values, metric)
-                if found.low is not None:
-                    bounded.append(found.low <= truth <= found.high)
-            row.append(f"{share(plain)} / {share(bounded) if bounded else 'not printed'}")
+                    interval = mean_interval(values, metric)
+                if interval.low is not None:
+                    printed.append(interval.low <= claimed <= interval.high)
+            row.append(f"{share(plain)} / {share(printed) if printed else 'not printed'}")
         yield row
 
 
@@ -310,10 +336,13 @@ def main() -> None:
     say("Coverage of differences of rates, as if independent / in use, exact:\n")
     table(("law", "12 scenes", "20 scenes", "60 scenes"), differences_of_rates(effort))
     say(
-        "Claims about other scenes, margin 0.1 m, `non-inferior` of a fixed number / until decided:\n"
+        "Claims about other scenes: how often the mean of a distance, cut at 4 m, is said to be within "
+        "or beyond its margin of 0.1 m, of a fixed number of scenes / until decided:\n"
     )
-    table(("law", "cut mean, m", "200 scenes", "400 scenes"), claims_beyond_the_cap(effort))
-    say("Coverage of printed intervals, t / in use:\n")
+    head = ("law and answer", "cut mean, m", "mean not cut, m")
+    sizes = ("20 scenes", "60 scenes", "200 scenes", "400 scenes")
+    table((*head, *sizes), claims_beyond_the_cap(effort))
+    say("Coverage: of t about the mean / of the printed interval about what it states:\n")
     table(("law", "3", "12", "20", "60"), printed_intervals(effort))
 
 

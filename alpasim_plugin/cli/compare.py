@@ -22,6 +22,7 @@ from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run, read_run
 from evaluators.statistics.paired import BLOCKS
+from evaluators.statistics.sentences import claim_text
 
 EPILOG = """
 Examples:
@@ -145,6 +146,7 @@ def _variant_lines(
         if differences[row.metric].n_cells and (all_metrics or row.metric in metric_table.headline)
     ]
     table = _table(rows, differences, metric_table) if rows else ["  no pair of rollouts"]
+    table += _notes([row.metric for row in rows], differences, metric_table)
     missing = _missing(differences, len(differences) if all_metrics else SHOWN)
     if len(missing) > SHOWN and not all_metrics:
         missing = [*missing[:SHOWN], f"  {len(missing) - SHOWN} more lines: --all"]
@@ -192,6 +194,21 @@ def _table(
         cells = [cell.ljust(width) for cell, width in zip(whole, widths, strict=True)]
         texts.append("  " + "  ".join(cells).rstrip())
     return texts
+
+
+def _notes(
+    names: Sequence[str], entries: Mapping[str, Difference], metric_table: MetricTable
+) -> list[str]:
+    """Say once what the verdicts on some metrics are about, and which have no interval, and why."""
+    by_text: dict[str, list[str]] = {}
+    for name in names:
+        entry = entries[name]
+        text = claim_text(entry, metric_table.info(name))
+        if entry.ci95 is None and entry.reason is not None:
+            text = f"no interval: {entry.reason}"
+        if text:
+            by_text.setdefault(text, []).append(name)
+    return [f"  {', '.join(metrics)}: {text}" for text, metrics in by_text.items()]
 
 
 def _missing(entries: Mapping[str, Difference], most: int) -> list[str]:

@@ -12,6 +12,7 @@ from evaluators.results import WORDS
 from evaluators.statistics.decision import CAUSES, Decision, read_decision
 from evaluators.statistics.numbers import labelled, printed, scale_and_unit
 from evaluators.statistics.opening import Run
+from evaluators.statistics.sentences import beyond_text
 
 WORST_CASE = "any bound"
 
@@ -61,6 +62,8 @@ def metric_rows(decision: Decision, table: MetricTable = METRICS) -> list[JsonOb
         rows.append(
             {
                 "metric": name,
+                "claim": criterion["claim"],
+                "beyond": "" if state["beyond"] is None else beyond_text(state["beyond"]),
                 "verdict": state["verdict"],
                 "tone": tone_of_cause(CAUSES[state["verdict"]]),
                 "diff": "no pair" if diff is None else diff + unit,
@@ -77,8 +80,9 @@ def metric_rows(decision: Decision, table: MetricTable = METRICS) -> list[JsonOb
 def decision_lines(decision: Decision) -> list[str]:
     """Return the last lines of a sequential run: verdict, one line a metric, and the guarantee."""
     metrics = [
-        f"{row['metric']}: {row['diff']} ({row['interval']}, margin {row['margin']}"
+        f"{row['metric']}: {row['diff']} ({row['claim']}: {row['interval']}, margin {row['margin']}"
         f"{'' if row['binding'] else ', not binding'}): {row['verdict']}, e-values {row['evidence']}"
+        f"{'; ' if row['beyond'] else ''}{row['beyond']}"
         for row in metric_rows(decision)
     ]
     error, rule = guarantee(decision)

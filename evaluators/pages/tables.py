@@ -22,6 +22,7 @@ from evaluators.statistics.numbers import (
     short,
 )
 from evaluators.statistics.opening import Run
+from evaluators.statistics.sentences import claim_text
 
 # verdict on other scenes against the margin, and the difference on these scenes -> words
 VERDICT_WORDS = {
@@ -170,10 +171,15 @@ def _pair_row(variant: str, metric: MetricInfo, entry: Difference) -> PairRow:
         texts = printed(metric, entry.diff, *bounds, sign=True)
         diff_cell = Cell(f"{texts[0]}\u00a0{unit}".strip("\u00a0"), note, sort=scale * entry.diff)
         if bounds:
-            bounds_cell = Cell(" to ".join(texts[1:]), note, sort=scale * (bounds[1] - bounds[0]))
+            claim = claim_text(entry, metric)
+            bounds_note = f"{note}; {claim}" if claim else note
+            width = scale * (bounds[1] - bounds[0])
+            bounds_cell = Cell(" to ".join(texts[1:]), bounds_note, sort=width)
     hint = ""
     if entry.direction != "none":
         hint = f"margin {short(entry.margin * scale, unit)}"
+        if entry.beyond is not None:
+            hint += f", {entry.claim}"
     return PairRow(
         variant,
         entry.baseline,

@@ -36,6 +36,7 @@ STEP = 0.05
 FREQUENCIES = np.exp(np.arange(math.log(1e-5), math.log(1e3), STEP))
 TOLERANCE = 1e-9  # of a bound, as a share of the range
 BINS = 256
+NO_BOUNDS = "nothing says how far a scene that was not driven can lie"
 
 
 def chance_above(values: F64, counts: F64, mean: float) -> float:
@@ -117,10 +118,10 @@ def _with_worst(values: F64, most: float, scale: float) -> tuple[F64, F64]:
     Many are put into bins that keep their mean: one between two edges counts in shares for both,
     which widens the bounds and never narrows.
     """
-    distinct, found = np.unique(
+    distinct, whole_counts = np.unique(
         np.append(np.asarray(values, dtype=np.float64) / scale, most / scale), return_counts=True
     )
-    counts = found.astype(np.float64)
+    counts = whole_counts.astype(np.float64)
     if len(distinct) <= BINS:
         return distinct, counts
     edges = np.linspace(distinct[0], distinct[-2], BINS)
@@ -173,21 +174,23 @@ def mean_interval(means: F64, metric: MetricInfo) -> Interval:
 
     Rates take `rate_interval`, other quantities with bounds `mean_bounds`. Where a metric counts up
     to a cap (`MetricInfo.cap`), what was not drawn may lie there: the interval holds the one of t
-    and `mean_bounds` of the values cut to the cap. All others take t, which knows only the spread
-    that it saw.
+    and `mean_bounds` of the values cut to the cap. All others have none: Student's knows only the
+    spread of the scenes that were drawn, and misses the mean where a few others lie far away.
     """
     n = len(means)
     centre = mean_of(means)
     least, most = metric.value_range
     if metric.is_flag:
         return rate_interval(means)
-    seen = t_interval(means, "scenes")
     reach = metric.cap if metric.cap is not None else most
-    if n < 2 or not math.isfinite(reach):
-        return within(seen, least, most)
+    if n < 2:
+        return Interval(centre, reason=f"needs at least two scenes, found {n}")
+    if not math.isfinite(reach):
+        return Interval(centre, reason=NO_BOUNDS)
     low, high = mean_bounds(means, least if math.isfinite(least) else -reach, reach)
     method = f"mean of scenes up to {reach:g} {metric.unit}".rstrip()
     if metric.cap is not None:
-        low = min(low, *(seen.bounds or [centre]))
-        high = max(high, *(seen.bounds or [centre]))
+        not_cut = t_interval(means, "scenes").bounds or [centre]
+        low = min(low, *not_cut)
+        high = max(high, *not_cut)
     return within(Interval(centre, low, high, method=method), least, most)

@@ -18,15 +18,16 @@ import math
 import os
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from typing_extensions import TypedDict
 
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.files import read_json_as
+from alpasim_plugin.core.metric_types import RATE_MARGIN
 from alpasim_plugin.core.types import F64, I64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.schema import DECISION
 from alpasim_plugin.log.run_folder.sides import Side
@@ -39,11 +40,12 @@ from evaluators.statistics.betting import (
     log_capital,
     lower_bound,
 )
-from evaluators.statistics.paired import Pairs, reach_of
+from evaluators.statistics.differences import beyond_words, claim_of, is_cut, reach_of
+from evaluators.statistics.paired import Pairs
 
 Answer = Literal["good", "bad", "open"]
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 MOST_SCENES = 4000  # that are asked for
 AGAIN = "give the command of the run again: finished rollouts are kept"
 WORDS: dict[Answer, str] = {"good": "non-inferior", "bad": "worse", "open": "undecided"}
@@ -74,6 +76,19 @@ class MetricQuestion:
     def reach(self) -> float:
         """Give the greatest difference of a scene that counts."""
         return reach_of(self.facts, self.margin)
+
+    @property
+    def claim(self) -> str:
+        """Give what the answer is about, in words."""
+        claim = claim_of(self.facts, self.margin)
+        if claim is None:
+            raise EvaluatorError(f"{self.metric}: no claim", "give a margin")
+        return claim
+
+    @property
+    def words(self) -> str:
+        """Name the metric, with what the answer is about where that is not its mean."""
+        return f"{self.metric} ({self.claim})" if is_cut(self.facts) else self.metric
 
 
 @dataclass(frozen=True)
@@ -191,6 +206,15 @@ def closed(log_e: F64) -> F64:
         return np.log(least) + scale
 
 
+class BeyondLook(TypedDict):
+    """A `evaluators.results.Beyond`."""
+
+    event: str
+    n: int
+    n_scenes: int
+    at_most: float
+
+
 class MetricLook(TypedDict):
     """What is known of one metric after the scenes of an interim analysis."""
 
@@ -202,6 +226,9 @@ class MetricLook(TypedDict):
     interval: list[float | None]
     e_good: float  # greatest e-value so far against what the good answer denies
     e_bad: float  # the same for the bad answer, adjusted for several metrics
+    # scenes of which only the cap counts; its ``at_most`` holds over all interim analyses, wrong in a
+    # share alpha of runs; None where nothing is cut, or before the first scene
+    beyond: BeyondLook | None
 
 
 @dataclass(frozen=True)
@@ -231,9 +258,11 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
     n = len(next(iter(values.values())))
     evidence = [
         _Evidence.of(
-            asked, values[asked.metric], Plan(asked.margin or None, horizon, question.alpha)
+            criterion,
+            values[criterion.metric],
+            Plan(criterion.margin or None, horizon, question.alpha),
         )
-        for asked in question.metrics
+        for criterion in question.metrics
     ]
     paths = [one_metric.paths(len(question.metrics), n) for one_metric in evidence]
     log_good = np.maximum.accumulate(np.array([good for good, _ in paths]), axis=1)
@@ -241,26 +270,27 @@ def state_after(question: Question, values: Mapping[str, F64], horizon: int) -> 
     bar = -math.log(question.alpha)
     is_good: Bool = log_good >= bar
     is_bad: Bool = log_bad >= bar
-    binding = [asked.binding for asked in question.metrics]
+    binding = [criterion.binding for criterion in question.metrics]
     all_good = is_good[binding].all(axis=0) & any(binding)
     answer = _first(np.asarray(all_good), np.asarray(is_bad.any(axis=0)))
     states: dict[str, MetricLook] = {}
-    for i, (asked, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
-        x = values[asked.metric]
+    for i, (criterion, metric_evidence) in enumerate(zip(question.metrics, evidence, strict=True)):
+        x = values[criterion.metric]
         center = float(np.nanmean(x)) if np.isfinite(x).any() else None
         low, high = metric_evidence.interval()
-        if asked.facts.direction == "higher":
+        if criterion.facts.direction == "higher":
             center, low, high = (None if end is None else -end for end in (center, high, low))
         e_good, e_bad = (
             float(np.exp(min(path[i, -1], 700.0))) if n else 0.0 for path in (log_good, log_bad)
         )
-        states[asked.metric] = {
+        states[criterion.metric] = {
             "verdict": WORDS[_first(is_good[i], is_bad[i])],
             "n_scenes": metric_evidence.draws.n,
             "diff": center,
             "interval": [low, high],
             "e_good": e_good,
             "e_bad": e_bad,
+            "beyond": metric_evidence.beyond(),
         }
     return State(n, answer, states)
 
@@ -271,7 +301,7 @@ def least_scenes(question: Question, most: int = MOST_SCENES) -> int | None:
     """
 
     def is_good(n: int) -> bool:
-        values = {asked.metric: np.zeros(n) for asked in question.metrics}
+        values = {criterion.metric: np.zeros(n) for criterion in question.metrics}
         return state_after(question, values, n).answer == "good"
 
     upper = 1
@@ -290,20 +320,24 @@ class _Evidence:
     Attributes:
         question: What is asked about it.
         draws: The differences that are known.
+        is_beyond: ``(k,)`` of them, those that are worse than what counts.
         places: ``(k,)`` scenes to which they belong.
         plan: Of the bets.
     """
 
     question: MetricQuestion
     draws: Draws
+    is_beyond: Bool
     places: I64
     plan: Plan
 
     @classmethod
-    def of(cls, asked: MetricQuestion, x: F64, plan: Plan) -> _Evidence:
-        known = np.flatnonzero(np.isfinite(x))
-        reach = asked.reach
-        return cls(asked, Draws(np.clip(x[known], -reach, reach), reach), known, plan)
+    def of(cls, question: MetricQuestion, x: F64, plan: Plan) -> _Evidence:
+        places = np.flatnonzero(np.isfinite(x))
+        reach = question.reach
+        harms = np.abs(x[places]) if question.facts.direction == "none" else x[places]
+        draws = Draws(np.clip(x[places], -reach, reach), reach)
+        return cls(question, draws, harms > reach, places, plan)
 
     def paths(self, sharing: int, n: int) -> tuple[F64, F64]:
         """Return the log e-processes for the good and for the bad answer after each of n scenes.
@@ -348,6 +382,24 @@ class _Evidence:
             return None, None
         return self._bound(self.draws, 1.0), -self._bound(self.draws.mirrored(), -1.0)
 
+    def beyond(self) -> BeyondLook | None:
+        """Count the scenes that are worse than what counts, with a bound of their rate that holds at
+        whatever scene one stops.
+        """
+        metric = self.question.facts
+        if self.draws.n == 0 or not is_cut(metric):
+            return None
+        events = Draws(-self.is_beyond.astype(np.float64), 1.0)
+        sizes = bet_sizes(events, -RATE_MARGIN, replace(self.plan, distance=RATE_MARGIN))
+        at_most = -float(lower_bound(events, sizes, self.plan.log_bar))
+        event = beyond_words(metric, self.question.margin)
+        return {
+            "event": event,
+            "n": int(np.sum(self.is_beyond)),
+            "n_scenes": self.draws.n,
+            "at_most": at_most,
+        }
+
     def _bound(self, draws: Draws, sign: float) -> float:
         sizes = bet_sizes(draws, sign * self.question.margin, self.plan)
         return float(lower_bound(draws, sizes, self.plan.log_bar))
@@ -373,12 +425,16 @@ def outcome_of(question: Question, state: State, ceiling: str) -> Outcome:
     if state.answer == "good":
         return Outcome("pass")
     if state.answer == "bad":
-        worse = [name for name, look in state.metrics.items() if look["verdict"] == WORDS["bad"]]
-        return Outcome("regression", tuple(f"{name} is worse" for name in worse))
+        worse = [
+            criterion.words
+            for criterion in question.metrics
+            if state.metrics[criterion.metric]["verdict"] == WORDS["bad"]
+        ]
+        return Outcome("regression", tuple(f"{words} is worse" for words in worse))
     left = [
-        asked.metric
-        for asked in question.metrics
-        if asked.binding and state.metrics[asked.metric]["verdict"] == WORDS["open"]
+        criterion.words
+        for criterion in question.metrics
+        if criterion.binding and state.metrics[criterion.metric]["verdict"] == WORDS["open"]
     ]
     return Outcome("undecided", (f"{', '.join(left) or 'nothing'} undecided: {ceiling}",))
 
@@ -387,6 +443,7 @@ class MetricAsked(TypedDict):
     """One metric of the question."""
 
     margin: float  # in the metric's unit
+    claim: str  # what the answer is about
     binding: bool
 
 
@@ -432,8 +489,12 @@ def question_as_dict(question: Question) -> AskedRecord:
         "alpha": question.alpha,
         "rule": question.rule,
         "metrics": {
-            asked.metric: {"margin": asked.margin, "binding": asked.binding}
-            for asked in question.metrics
+            criterion.metric: {
+                "margin": criterion.margin,
+                "claim": criterion.claim,
+                "binding": criterion.binding,
+            }
+            for criterion in question.metrics
         },
     }
 

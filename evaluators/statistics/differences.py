@@ -2,7 +2,8 @@
 
 A claim about a distance is about the mean of the scenes' differences *cut* at the metric's cap: no
 sample bounds what is not cut, and nothing is assumed about what lies beyond. How often a scene goes
-beyond is an event with a margin of its own (`left_route` of `lateral_distance_m`).
+beyond is an event of its own with an exact rate, and with a margin of its own where a gate has one
+(`left_route` of `lateral_distance_m`).
 """
 
 from __future__ import annotations
@@ -11,21 +12,24 @@ import math
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, MetricInfo
+from alpasim_plugin.core.types import F64, I64, Direction, MetricInfo
+from evaluators.results import Beyond
 from evaluators.statistics.bounded import mean_bounds
 from evaluators.statistics.intervals import (
     FEW_SCENES,
+    LEAST_SCENES,
     Interval,
     are_alike,
     cluster_means,
     paired_rate,
+    rate_at_most,
     t_interval,
 )
 
-LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
 # margins: a scene's difference in a quantity without bounds or a cap of its own counts up to so much
 REACH = 40.0
-NO_BOUNDS = "nothing says how much a scene that was not driven can differ: no interval holds"
+NO_CLAIM = "nothing says how much a scene that was not driven can differ"
+WORSE: dict[Direction, str] = {"lower": "worse", "higher": "worse", "none": "different"}
 
 
 def reach_of(metric: MetricInfo, margin: float) -> float:
@@ -47,18 +51,45 @@ def is_cut(metric: MetricInfo) -> bool:
     return not math.isfinite(max(metric.difference_range))
 
 
-def claim_name(metric: MetricInfo, margin: float) -> str:
-    """Return what a claim about a metric is about, in words.
+def claim_of(metric: MetricInfo, margin: float) -> str | None:
+    """Return what a claim about a metric is about, in words; None where none can be made.
 
     Example:
         >>> from evaluators.metrics import METRICS
-        >>> claim_name(METRICS.info("lateral_distance_m"), 0.1)
-        'lateral_distance_m cut at 4 m'
+        >>> claim_of(METRICS.info("lateral_distance_m"), 0.1)
+        'mean cut at 4 m'
+        >>> claim_of(METRICS.info("offroad"), 0.05)
+        'mean'
     """
     reach = reach_of(metric, margin)
-    if not is_cut(metric) or reach == 0.0:
-        return metric.name
-    return f"{metric.name} cut at {reach:g} {metric.unit}".rstrip()
+    if reach == 0.0:
+        return None
+    return f"mean cut at {reach:g} {metric.unit}".rstrip() if is_cut(metric) else "mean"
+
+
+def beyond_words(metric: MetricInfo, margin: float) -> str:
+    """Name the event that a scene's difference is worse than the cut of a claim.
+
+    Example:
+        >>> from evaluators.metrics import METRICS
+        >>> beyond_words(METRICS.info("lateral_distance_m"), 0.1)
+        'worse by more than 4 m'
+    """
+    reach = reach_of(metric, margin)
+    return f"{WORSE[metric.direction]} by more than {reach:g} {metric.unit}".rstrip()
+
+
+def beyond_of(means: F64, metric: MetricInfo, margin: float) -> Beyond | None:
+    """Count the scenes ``(G,)`` whose difference is worse than the cut of a claim, with the exact
+    bound of their rate; None where no difference is cut.
+    """
+    reach = reach_of(metric, margin)
+    if reach == 0.0 or not is_cut(metric):
+        return None
+    harms = {"none": np.abs(means), "lower": means, "higher": -means}[metric.direction]
+    n = int(np.sum(harms > reach))
+    event = beyond_words(metric, margin)
+    return Beyond(event, n, len(means), rate_at_most(n, len(means)))
 
 
 def difference_bounds(
@@ -70,7 +101,7 @@ def difference_bounds(
     The claim's bounds are those of `evaluators.statistics.bounded` for differences cut at
     `reach_of`: they allow for scenes at the worst possible value that were not drawn. Rates print
     the interval of `flag_interval`. Where differences are cut, the printed interval also holds that
-    of t and the mean of what was seen, which is not cut.
+    of t and the mean of these scenes, which are not cut.
 
     Args:
         delta: ``(N,)`` differences per cell.
@@ -85,17 +116,18 @@ def difference_bounds(
         return flag_interval(delta, scenes), list(mean_bounds(means, -reach, reach))
     plain = t_interval(means, "scenes")
     if reach == 0.0:
-        return Interval(plain.centre, reason=NO_BOUNDS), None
+        return Interval(plain.centre, reason=NO_CLAIM), None
     low, high = mean_bounds(means, -reach, reach)
     guarded = [low, high]
+    method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     if is_cut(metric):
-        seen = [plain.centre, *(plain.bounds or [])]
-        low = min(low, *seen)
-        high = max(high, *seen)
+        not_cut = [plain.centre, *(plain.bounds or [])]
+        low = min(low, *not_cut)
+        high = max(high, *not_cut)
+        method = f"{claim_of(metric, margin)}, joined with t"
     note = ""
     if are_alike(means):
         note = f"all {n} scenes are equal, so that they have no spread to go by"
-    method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
     return Interval(plain.centre, low, high, note=note, method=method), guarded
 
 
@@ -129,9 +161,10 @@ def flag_interval(delta: F64, scenes: I64) -> Interval:
     return Interval(up - down, max(low, -1.0), min(high, 1.0), note=note, method=method)
 
 
-def _joined(one: float, other: float, correlation: float) -> float:
+def _joined(gained_half: float, lost_half: float, correlation: float) -> float:
     """Return the half-width of a difference from those of its parts and their correlation."""
-    return math.sqrt(one**2 + other**2 - 2.0 * correlation * one * other)
+    product = 2.0 * correlation * gained_half * lost_half
+    return math.sqrt(gained_half**2 + lost_half**2 - product)
 
 
 def _correlation(gained: F64, lost: F64) -> float:

@@ -19,11 +19,13 @@ from alpasim_plugin.core.types import F64, I64, Bool
 Z95 = 1.96
 LEVEL = 0.95
 TAIL = (1 - LEVEL) / 2
+RATE_LEVEL = 0.95  # one-sided, of the largest rate that counts leave open
 ROUNDING = 1e-12  # values that differ by no more than this, relative, are equal
 TOO_LARGE = "the values are too large for their spread to be a number"
 # the squares of larger values are no numbers, and those of their inverses lose their digits
 LARGE = 1e150
 NO_SPREAD = "all {} {} are equal: a sample without spread has no interval"
+LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
 FEW_SCENES = 10  # below, counts and exact methods come first
 
 
@@ -112,12 +114,17 @@ def t_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
         return Interval(centre, reason=f"needs at least two {unit}, found {len(x)}")
     if are_alike(x):
         return Interval(centre, reason=NO_SPREAD.format(len(x), unit))
-    half = float(scipy.special.stdtrit(len(x) - 1, 1 - TAIL) * np.std(x, ddof=1)) / len(x) ** 0.5
+    half = t_half_width(float(np.std(x, ddof=1)), len(x))
     low = centre - half * scale
     high = centre + half * scale
     if not np.isfinite([low, high]).all():
         return Interval(centre, reason=TOO_LARGE)
     return Interval(centre, low, high, method=f"t on {unit}")
+
+
+def t_half_width(spread: float, n: int) -> float:
+    """Return the half-width of Student's interval of ``n`` values with a standard deviation."""
+    return float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * spread / math.sqrt(n)
 
 
 def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
@@ -158,6 +165,18 @@ def exact_rate(k: float, n: int) -> tuple[float, float]:
     return low, float(scipy.special.betaincinv(k + 1, n - k, 1 - TAIL)) if k < n else 1.0
 
 
+def rate_at_most(count: int, n: int, level: float = RATE_LEVEL) -> float:
+    """Return the exact one-sided upper bound of a rate (Clopper and Pearson).
+
+    Example:
+        >>> round(rate_at_most(0, 14), 3)
+        0.193
+    """
+    if count >= n:
+        return 1.0
+    return float(scipy.special.betaincinv(count + 1, n - count, level))
+
+
 def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
     """Return Tango's score bounds of a difference of rates from ``n`` pairs, of which some gained
     and some lost the event.
@@ -178,11 +197,11 @@ def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
         variance = n * (2 * share + difference * (1 - difference))
         return (gained - lost - n * difference) / math.sqrt(max(variance, 1e-12))
 
-    seen = (gained - lost) / n
+    observed = (gained - lost) / n
     low = -1.0
     high = 1.0
     if score(-1 + 1e-9) > Z95:
-        low = scipy.optimize.brentq(lambda d: score(d) - Z95, -1 + 1e-9, seen)
+        low = scipy.optimize.brentq(lambda d: score(d) - Z95, -1 + 1e-9, observed)
     if score(1 - 1e-9) < -Z95:
-        high = scipy.optimize.brentq(lambda d: score(d) + Z95, seen, 1 - 1e-9)
+        high = scipy.optimize.brentq(lambda d: score(d) + Z95, observed, 1 - 1e-9)
     return float(low), float(high)

@@ -30,13 +30,12 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.types import F64
 from evaluators.statistics.bounded import chance_of_mean
-from evaluators.statistics.intervals import TAIL
+from evaluators.statistics.intervals import TAIL, rate_at_most
 
 CUT_MARGINS = 3.0  # at which the harm of a cell is cut
 # A drive beyond the cut is no noise of a run whose other cells differ by so many times less: with the
 # heavy tails of t(3) it happens in half a percent of runs.
 APART = 8.0
-RATE_LEVEL = 0.95  # of the printed rate of drives beyond the cut, one-sided
 OUTSIDE = 0.0005  # chance that the rate of gone events is none of them
 NUISANCE = 200  # rates of gone events at which the error of the test of events is computed
 HALVINGS = 40
@@ -127,18 +126,6 @@ def beyond(harms: F64, margin: float, rounding: float = 0.0) -> Beyond:
     largest = float(np.max(harms, initial=0.0)) / APART
     is_quiet = bool((others <= largest).all())
     return Beyond(int(np.sum(is_worse)), int(np.sum(harms < -most)), len(harms), is_quiet)
-
-
-def rate_at_most(count: int, n: int, level: float = RATE_LEVEL) -> float:
-    """Return the exact one-sided upper bound of a rate (Clopper and Pearson).
-
-    Example:
-        >>> round(rate_at_most(0, 14), 3)
-        0.193
-    """
-    if count >= n:
-        return 1.0
-    return float(scipy.special.betaincinv(count + 1, n - count, level))
 
 
 def chance_of_more(worse: int, better: int) -> float:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, I64, Bool
+from alpasim_plugin.core.types import F64, Bool
 from alpasim_plugin.log.run_folder.sides import (
     Cell,
     RolloutTable,
@@ -28,7 +28,6 @@ from alpasim_plugin.log.run_folder.sides import (
 )
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
 from evaluators.results import (
-    Beyond,
     Bounds,
     CellCounts,
     Difference,
@@ -37,26 +36,26 @@ from evaluators.results import (
     SceneCounts,
     Verdict,
 )
-from evaluators.statistics.bounded import mean_bounds, upper_bound
-from evaluators.statistics.differences import flag_interval
+from evaluators.statistics.differences import (
+    beyond_of,
+    claim_of,
+    difference_bounds,
+    reach_of,
+)
 from evaluators.statistics.intervals import (
+    LEAST_SCENES,
     ROUNDING,
     TOO_LARGE,
-    Interval,
-    are_alike,
     cluster_means,
     mean_of,
     n_clusters,
     scaled,
-    t_interval,
+    t_half_width,
     within,
 )
 from evaluators.statistics.variants import Variant, axis_bases, variants_in
 from evaluators.statistics.verdicts import (
-    BEYOND,
-    LEAST_SCENES,
     MOST_SCENES,
-    REACH,
     corrected,
     difference,
     harm,
@@ -284,24 +283,29 @@ def measure(
     if len(means) < 2:
         return replace(entry, reason=f"needs at least two scenes, found {len(means)}")
     p_value, test = sign_flip(means)
-    small, scale = scaled(means)
+    claim = claim_of(metric, margin)
+    counted = means
+    if claim is not None:
+        reach = reach_of(metric, margin)
+        counted = np.clip(means, -reach, reach)
+    small, scale = scaled(counted)
     interval, guarded = difference_bounds(delta, means, pairs.scenes, metric, margin)
     bounds = within(interval, *metric.difference_range).bounds
     entry = replace(
         entry,
         p_value=p_value,
         test=test,
+        claim=claim,
+        cut_mean=None if claim is None else mean_of(counted),
         spread=scale * float(np.std(small, ddof=1)),
         ci95=_pair_of(bounds),
         method=interval.method or None,
         guarded=_pair_of(guarded),
         note=interval.note or None,
+        beyond=beyond_of(means, metric, margin),
     )
     if bounds is None:
         return replace(entry, reason=interval.reason, note=None)
-    if beyond_share(metric, margin):
-        event_pairs = Pairs(side, base, metric.event)
-        return replace(entry, beyond=_beyond(pairs, event_pairs, metric, margin))
     return entry
 
 
@@ -322,7 +326,7 @@ def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> 
     )
     if entry.ci95 is None:
         return entry
-    answer, reasons = _verdict_about_others(entry, metric, entry.ci95, p_corrected)
+    answer, reasons = _verdict_about_others(entry, metric, p_corrected)
     notes = [*([entry.note] if entry.note else []), *reasons]
     entry = replace(entry, verdict=answer, note="; ".join(notes) or None)
     if answer != "undecided" or (metric.direction == "none" and entry.margin == 0.0):
@@ -331,42 +335,45 @@ def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> 
 
 
 def _verdict_about_others(
-    entry: Difference, metric: MetricInfo, bounds: Bounds, p_corrected: float
+    entry: Difference, metric: MetricInfo, p_corrected: float
 ) -> tuple[Verdict, list[str]]:
     """Return the verdict about scenes that were not drawn, and what kept it from being another."""
     n, margin, guarded = entry.n_scenes, entry.margin, entry.guarded
     if n < LEAST_SCENES:
         return "undecided", [f"{n} scenes: a verdict needs at least {LEAST_SCENES}"]
-    if guarded is None:
-        return "undecided", [
-            "nothing says how much a scene can differ, so that nothing is decided without a margin"
-        ]
-    joined = (min(bounds[0], guarded[0]), max(bounds[1], guarded[1]))
-    answer = verdict(joined, p_corrected, margin, metric.direction)
-    unguarded = verdict(bounds, p_corrected, margin, metric.direction)
+    unguarded_bounds = _unguarded_bounds(entry, metric)
+    bounds = guarded
+    if metric.is_flag and guarded is not None and unguarded_bounds is not None:
+        bounds = (min(unguarded_bounds[0], guarded[0]), max(unguarded_bounds[1], guarded[1]))
+    answer = verdict(bounds, p_corrected, margin, metric.direction)
+    unguarded = verdict(unguarded_bounds, p_corrected, margin, metric.direction)
     reasons = []
-    if unguarded != answer:
+    if unguarded not in (answer, "undecided"):
         turned = "worse" if unguarded == "non-inferior" else "better"
         by = f"{reach_of(metric, margin):g} {metric.unit}".rstrip()
         reasons.append(f"{n} scenes cannot exclude that a few others are {turned} by up to {by}")
-    beyond = entry.beyond
-    if answer == "non-inferior" and beyond is not None and beyond.at_most >= beyond.margin:
-        answer = "undecided"
-        event = f"{beyond.event} in more than {100 * beyond.margin:.3g} % of others"
-        reasons.append(f"{n} scenes cannot exclude {event}")
     return answer, reasons
+
+
+def _unguarded_bounds(entry: Difference, metric: MetricInfo) -> Bounds | None:
+    """Return the bounds that go by the spread of these scenes alone; None where they have none."""
+    if metric.is_flag:
+        return entry.ci95
+    if entry.cut_mean is None or not entry.spread:
+        return None
+    half = t_half_width(entry.spread, entry.n_scenes)
+    return entry.cut_mean - half, entry.cut_mean + half
 
 
 def _more_scenes(entry: Difference, metric: MetricInfo) -> int | None:
     """Return how many more scenes would decide an undecided difference; None where none would."""
-    if entry.diff is None or entry.spread is None:
+    if entry.cut_mean is None or entry.spread is None:
         return None
-    worse = abs(entry.diff)
+    worse = abs(entry.cut_mean)
     if metric.direction != "none":
-        worse, _ = harm((entry.diff, entry.diff), metric.direction)
-    reach = reach_of(metric, entry.margin) or None
-    rare = beyond_share(metric, entry.margin)
-    return more_scenes(worse, entry.spread, entry.n_scenes, entry.margin, reach, rare)
+        worse, _ = harm((entry.cut_mean, entry.cut_mean), metric.direction)
+    reach = reach_of(metric, entry.margin)
+    return more_scenes(worse, entry.spread, entry.n_scenes, entry.margin, reach)
 
 
 def _scene_means(pairs: Pairs, delta: F64) -> F64:
@@ -395,85 +402,10 @@ def _pair_of(bounds: Sequence[float] | None) -> Bounds | None:
     return None if bounds is None else (bounds[0], bounds[1])
 
 
-def _beyond(pairs: Pairs, event_pairs: Pairs, metric: MetricInfo, margin: float) -> Beyond:
-    """Return how much more often something happens that a distance does not count: by the metric's
-    event where a preset has it, else by differences beyond `reach_of`.
-    """
-    reach = reach_of(metric, margin)
-    event = metric.event
-    scenes = event_pairs.scenes
-    change = event_pairs.mine - event_pairs.base
-    if not len(change):
-        event = f"more than {reach:g} {metric.unit}".rstrip()
-        scenes = pairs.scenes
-        far = pairs.mine - pairs.base
-        worse = {"none": np.abs(far), "lower": far, "higher": -far}[metric.direction]
-        change = np.where(worse > reach, 1.0, 0.0) - np.where(worse < -reach, 1.0, 0.0)
-    means, _ = cluster_means(change, scenes)
-    return Beyond(event, mean_of(means), upper_bound(means, 1.0), beyond_share(metric, margin))
-
-
-def difference_bounds(
-    delta: F64, means: F64, scenes: I64, metric: MetricInfo, margin: float
-) -> tuple[Interval, list[float] | None]:
-    """Return the interval of a mean difference, and the guarded bounds that a verdict must hold for
-    too; None where there are none.
-
-    Rates take the interval of `flag_interval`, other quantities with bounds that of
-    `evaluators.statistics.bounded`, all others t. The guarded bounds allow for scenes at the worst
-    possible value that were not drawn; without bounds, differences are cut to `reach_of`.
-
-    Args:
-        delta: ``(N,)`` differences per cell.
-        means: ``(G,)`` their means per scene, at least two.
-        scenes: Scene of each cell.
-        metric: What it is.
-        margin: How much worse is accepted.
-    """
-    n = len(means)
-    reach = reach_of(metric, margin)
-    guarded = list(mean_bounds(means, -reach, reach)) if reach else None
-    if metric.is_flag:
-        return flag_interval(delta, scenes), guarded
-    plain = t_interval(means, "scenes")
-    if guarded is None or not (are_alike(means) or np.isfinite(metric.difference_range).all()):
-        return plain, guarded
-    note = (
-        f"all {n} scenes are equal, so that they have no spread to go by"
-        if are_alike(means)
-        else ""
-    )
-    method = f"mean of scenes that differ by at most {reach:g} {metric.unit}".rstrip()
-    return Interval(plain.centre, guarded[0], guarded[1], note=note, method=method), guarded
-
-
-def reach_of(metric: MetricInfo, margin: float) -> float:
-    """Return how much worse a scene can be, in the metric's unit; 0 where nothing says so.
-
-    Where differences have no bounds it is the metric's cap, else `REACH` times its own margin, or
-    the given one where it has none.
-    """
-    most = max(metric.difference_range)
-    if math.isfinite(most):
-        return float(most)
-    return REACH * (metric.accepted or margin) if metric.cap is None else metric.cap
-
-
-def beyond_share(metric: MetricInfo, margin: float) -> float:
-    """Return in how many more scenes a metric may differ by more than `reach_of` and still be
-    non-inferior: if these are worse by `BEYOND` times as much, the margin holds. 0 where none can.
-    """
-    reach = reach_of(metric, margin)
-    if reach == 0.0 or math.isfinite(max(metric.difference_range)):
-        return 0.0
-    return max(margin, metric.accepted) / (BEYOND * reach)
-
-
 def least_scenes(metric: MetricInfo, margin: float) -> int | None:
     """Return how many scenes without any difference `non-inferior` takes; None where none do."""
-    rare = beyond_share(metric, margin)
     needed = scenes_without_event(margin, reach_of(metric, margin) or math.inf)
-    needed = max(needed, scenes_without_event(rare) if rare else 0, LEAST_SCENES)
+    needed = max(needed, LEAST_SCENES)
     return int(needed) if needed <= MOST_SCENES else None
 
 

@@ -4,22 +4,21 @@ report and the terminal.
 
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
-from evaluators.results import Difference
-from evaluators.statistics.intervals import FEW_SCENES
+from evaluators.results import Difference, to_json
+from evaluators.statistics.intervals import FEW_SCENES, LEAST_SCENES
 from evaluators.statistics.numbers import (
     plural,
     printed,
     scale_and_unit,
     short,
 )
-from evaluators.statistics.verdicts import LEAST_SCENES
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 NAMED = 3  # scenes and cells in a sentence
 
 
 def difference_text(entry: Difference, metric: MetricInfo) -> str:
-    """Say a paired difference, its interval, and what would decide it.
+    """Say a paired difference, its interval, what its verdict is about, and what would decide it.
 
     Args:
         entry: The difference.
@@ -37,10 +36,42 @@ def difference_text(entry: Difference, metric: MetricInfo) -> str:
         text = f"exact test p = {short(entry.p_value)}{can}; {text}"
     if bounds:
         text += f", 95\u00a0% interval {numbers[1]} to {numbers[2]}"
+    elif entry.reason is not None:
+        text += f"; no interval: {entry.reason}"
+    claim = claim_text(entry, metric)
+    if claim:
+        text += f"; {claim}"
     needed = more_scenes_text(entry.more_scenes)
     if needed:
         text += f"; {needed} on the margin of {short(entry.margin * scale, unit)}"
     return text
+
+
+def claim_text(entry: Difference, metric: MetricInfo) -> str:
+    """Say what the verdict on a distance is about, and what lies beyond; empty where nothing is cut.
+
+    Args:
+        entry: The difference.
+        metric: What was compared.
+    """
+    if entry.beyond is None or entry.cut_mean is None:
+        return ""
+    text = f"the verdict is about the {entry.claim}"
+    if entry.beyond.n:
+        centre = printed(metric, entry.cut_mean, sign=True)[0]
+        text += f", {centre}\u00a0{metric.unit}".rstrip("\u00a0")
+    return f"{text}; {beyond_text(to_json(entry.beyond))}"
+
+
+def beyond_text(beyond: JsonView) -> str:
+    """Say how many scenes lie beyond the cap of a claim, and how many others may.
+
+    Args:
+        beyond: An `evaluators.results.Beyond`.
+    """
+    scenes = plural(beyond["n_scenes"], "scene")
+    at_most = f"{100 * beyond['at_most']:.2g}\u00a0%"
+    return f"{beyond['n']} of {scenes} {beyond['event']}, of others at most {at_most}"
 
 
 def more_scenes_text(more: int | None) -> str:

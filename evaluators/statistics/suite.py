@@ -19,7 +19,7 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, Bool, MetricInfo
 from alpasim_plugin.log.run_folder.sides import Side
 from evaluators.results import MissingPair, Verdict
-from evaluators.statistics.intervals import TAIL, cluster_means
+from evaluators.statistics.intervals import TAIL, cluster_means, rate_at_most
 from evaluators.statistics.noise import (
     CUT_MARGINS,
     Beyond,
@@ -28,7 +28,6 @@ from evaluators.statistics.noise import (
     chance_at_rate,
     chance_within,
     cut,
-    rate_at_most,
     rejected_together,
     seeds_for_mean,
     seeds_for_rate,

@@ -13,7 +13,7 @@ import scipy  # its submodules load on first use; scipy.stats would take a secon
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Direction
 from evaluators.results import EXIT_CODES, Bounds, Cause, Contrast, Failures, Outcome, Verdict
-from evaluators.statistics.intervals import ROUNDING, TAIL, scaled
+from evaluators.statistics.intervals import LEAST_SCENES, ROUNDING, TAIL, scaled
 
 # Where causes meet, the first one found here decides: numbers from an incomplete run may mislead
 # either way.
@@ -84,10 +84,6 @@ def outcome_of_failures(failures: Failures, max_share: float = 0.0) -> Outcome:
 
 
 ALPHA = 0.05
-LEAST_SCENES = 6  # the fewest that can reach p < 0.05 in the two-sided sign test
-# margins: a scene's difference in a quantity without bounds or a cap of its own counts up to so much
-REACH = 40.0
-BEYOND = 2.5  # what lies beyond may be worse by so many times what counts, and the margin holds
 FLIPS = 9_999  # drawn where not all of them are counted
 FLIPPED = 10_000_000  # signs that are drawn at most
 
@@ -281,27 +277,24 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> float:
 
 
 def more_scenes(
-    harm: float, spread: float, n_scenes: int, margin: float, reach: float | None, rare: float
+    harm: float, spread: float, n_scenes: int, margin: float, reach: float
 ) -> int | None:
     """Return how many more scenes would decide an undecided verdict at the least: with 80 %
     probability if what was seen is true, and no other scene is far worse.
 
     Args:
-        harm: The difference seen, positive is worse.
+        harm: The mean difference that the claim is about, positive is worse.
         spread: Standard deviation of the difference between scenes.
         n_scenes: Scenes so far.
         margin: As for the verdict.
-        reach: The most that counts of a scene; None where nothing is known of it.
-        rare: Share of scenes that may differ by more; 0 where none can.
+        reach: The most that counts of a scene.
 
     Returns:
         At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
         needed.
     """
     needed = max(scenes_needed(abs(harm - margin), spread), LEAST_SCENES)
-    if reach is not None:  # as many again as show that nothing was missed
-        worst = reach - harm if harm < margin else reach + harm
-        needed = max(needed, scenes_without_event(abs(margin - harm), worst))
-    if rare > 0.0 and harm < margin:
-        needed = max(needed, scenes_without_event(rare))
+    # as many as show that nothing was missed
+    worst = reach - harm if harm < margin else reach + harm
+    needed = max(needed, scenes_without_event(abs(margin - harm), worst))
     return None if needed > MOST_SCENES else max(1, math.ceil(needed) - n_scenes)

@@ -144,6 +144,37 @@ def test_metres_get_no_good_answer_by_scenes_that_cannot_have_shown_the_tail(met
     assert state_after(question, {metric: alike}, 200).answer == "good"
 
 
+def test_an_answer_about_a_distance_names_its_cut_mean_and_bounds_what_lies_beyond():
+    """One scene in a hundred is 25 m worse: the mean is 0.25 m worse, the cut mean 0.04 m."""
+    x = np.where(np.arange(300) % 100 == 50, 25.0, 0.0)
+    question = asked(("lateral_distance_m", 0.2))
+    state = state_after(question, {"lateral_distance_m": x}, 300)
+    assert state.answer == "good"
+    assert question.metrics[0].claim == "mean cut at 4 m"
+    beyond = state.metrics["lateral_distance_m"]["beyond"]
+    assert (beyond["event"], beyond["n"], beyond["n_scenes"]) == ("worse by more than 4 m", 3, 300)
+    assert 0.01 < beyond["at_most"] < 0.06
+    opened = state_after(question, {"lateral_distance_m": x[:20]}, 300)
+    assert outcome_of(question, opened, "all driven").reasons == (
+        "lateral_distance_m (mean cut at 4 m) undecided: all driven",
+    )
+    rate = state_after(asked(("offroad", 0.2)), {"offroad": np.zeros(40)}, 40)
+    assert rate.metrics["offroad"]["beyond"] is None
+
+
+def test_the_bound_of_what_lies_beyond_a_cap_holds_wherever_one_stops():
+    """Three scenes in a hundred lie beyond; the bound is below that at some scene in few runs."""
+    question = asked(("lateral_distance_m", 0.1))
+    wrong = 0
+    for number in range(40):
+        x = np.where(rng(2000 + number).random(150) < 0.03, 20.0, 0.0)
+        beyond = state_after(question, {"lateral_distance_m": x}, 150).metrics[
+            "lateral_distance_m"
+        ]["beyond"]
+        wrong += beyond["at_most"] < 0.03
+    assert wrong <= 4
+
+
 def test_metres_get_no_bad_answer_where_few_scenes_that_are_far_better_bring_the_mean_to_the_margin():
     question = Question((metric_question("lateral_distance_m", 0.1),))
     wrong = 0

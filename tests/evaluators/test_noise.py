@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.seeding import stream
-from evaluators.statistics.intervals import TAIL, exact_rate, paired_rate
+from evaluators.statistics.intervals import TAIL, exact_rate, paired_rate, rate_at_most
 from evaluators.statistics.noise import (
     beyond,
     chance_at_margin,
     chance_at_rate,
     chance_of_more,
     chance_within,
-    rate_at_most,
     rejected_together,
     seeds_for_mean,
     seeds_for_rate,
