@@ -306,6 +306,24 @@ class Endings:
 
 
 @dataclass(frozen=True)
+class Change:
+    """How the rollouts of a variant ended in a run, and in the run before that drove the same scenes
+    and seeds with it.
+
+    Attributes:
+        run: Place of the run before among those that were compared.
+        earlier_failed, later_failed: Rollouts with an outcome, such as a collision, or that could
+            not be run.
+        more_failed: How many more failed in the later run; negative where fewer did.
+    """
+
+    run: int
+    earlier_failed: int
+    later_failed: int
+    more_failed: int
+
+
+@dataclass(frozen=True)
 class InvalidValues:
     """Rollouts without a valid value of a metric.
 

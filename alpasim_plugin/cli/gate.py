@@ -15,7 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.log.run_folder.schema import PAGES
 from alpasim_plugin.runs.joined import check_apart, join_runs, missing_shards
-from alpasim_plugin.runs.reports import write_reports
+from alpasim_plugin.runs.reports import update_run_list, write_reports
 from alpasim_plugin.runs.self_test import run_self_test
 from alpasim_plugin.runs.tables import ensure_tables
 from evaluators.metrics.presets import DEFAULT
@@ -110,14 +110,22 @@ def gate(
         verdict = verdict.with_outcome(Outcome("incomplete", (absent,)))
     folder = out if run.folders else out or run.folder
     files = write_gate_files(verdict, source, run, folder)
-    if out is None and not run.folders and os.path.isfile(run.folder / PAGES[0]):
-        write_reports(run.folder)
+    if folder == run.folder:
+        _show_in_pages(run.folder)
     facts = {**verdict.as_dict(), "files": [str(path) for path in files]}
     lines = verdict_lines(verdict)
     if folder is None:
         lines.append("gate.md and gate.junit.xml of several runs are written with --out FOLDER")
     show(as_json, facts, *lines)
     raise typer.Exit(verdict.exit_code)
+
+
+def _show_in_pages(folder: Path) -> None:
+    """Write the run's report again, where it has one, and the list of runs."""
+    if os.path.isfile(folder / PAGES[0]):
+        write_reports(folder)
+    else:
+        update_run_list(folder)
 
 
 def _opened(folders: Sequence[Path]) -> tuple[Run, str | None]:

@@ -5,10 +5,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.cli.output import show, warn
+from alpasim_plugin.cli.output import letters_of, show, terminal_width, warn
 from alpasim_plugin.core.errors import InputError
 from evaluators.metrics import METRICS
-from evaluators.pages.runs import RunEntry, find_runs, runs_table
+from evaluators.pages.runs import RunEntry, find_runs, run_paragraph, runs_table
 from evaluators.statistics.numbers import plural
 
 VALUES = ("mean", "ci95_clustered", "n_rollouts")
@@ -45,11 +45,21 @@ def list_runs(
             f"--metric {unknown[0]}: no such metric", "simrun list metrics names them."
         )
     rows = [entry.as_dict() | {"metrics": _values(entry, metrics)} for entry in chosen]
-    lines: list[Any] = [runs_table(chosen, roots[0], metrics)] if chosen else []
+    lines: list[Any] = []
+    if chosen:
+        lines = _run_lines(chosen, roots[0], metrics)
     count = f"{plural(len(chosen), 'run')} of {len(entries)} below {', '.join(map(str, roots))}"
     show(as_json, {"runs": rows, "found": len(entries)}, *lines, count)
     if not as_json:
         _warn_of_unreadable(entries)
+
+
+def _run_lines(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) -> list[Any]:
+    """Return a table of runs where the terminal is as wide as it, else some lines for each run."""
+    table = runs_table(entries, root, metrics)
+    if letters_of(table) <= terminal_width():
+        return [table]
+    return [line for entry in entries for line in run_paragraph(entry, root, metrics)]
 
 
 def _stored_metrics(entries: Sequence[RunEntry]) -> set[str]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich import progress
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.table import Table
 
 from alpasim_plugin.core.escape import terminal
 from alpasim_plugin.core.files.stage import stages_in
@@ -32,6 +33,7 @@ if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its ke
 SHOWN_CHANGES = 4
 SHOWN_SCENES = 5
 MAX_LINES = 1000  # of finished rollouts on a pipe
+MOST_LETTERS = 1000  # of a table that is measured
 LARGE_PX = 1_000_000  # of the cameras of a scene, from which on a run says what they cost
 PX_PER_S = 5e6  # that one core draws of a built scene, within a factor of two
 LINE_EVERY_S = 10.0  # on a pipe, within one stage
@@ -78,6 +80,11 @@ def first_screen(run: Run) -> list[Any]:
 def terminal_width() -> int:
     """Return how many letters fit on a line of standard output, 80 where it is no terminal."""
     return Console().width
+
+
+def letters_of(table: Table) -> int:
+    """Return how many letters a line of a table takes where nothing is folded."""
+    return Console(width=MOST_LETTERS).measure(table).maximum
 
 
 class Progress(progress.Progress):

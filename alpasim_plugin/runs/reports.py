@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from alpasim_plugin.core.errors import SimrunError
+from alpasim_plugin.core.files import real
 from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import U8, RolloutLog
@@ -25,12 +26,17 @@ from evaluators.pages.flips import (
     key_of_entry,
 )
 from evaluators.pages.html import write_report
+from evaluators.pages.run_list import write_run_list
+from evaluators.pages.runs import find_runs
+from evaluators.statistics.history import PastRun, changes_between
 from evaluators.statistics.opening import Run, read_run
+
+RUNS = Path("runs")  # below the working folder: where runs go whose command names no folder
 
 
 def write_reports(root: Path, page: bool = True) -> Path | None:
     """Write ``summary.md``, ``junit.xml`` and ``report.html`` of a run folder and
-    return the path of the last.
+    return the path of the last. Where it lies below `RUNS`, the list of runs is written too.
 
     Args:
         root: A run folder whose tables are written.
@@ -53,7 +59,24 @@ def write_reports(root: Path, page: bool = True) -> Path | None:
         for name in PAGES:
             (root / name).unlink(missing_ok=True)
     state_files(root, REPORTS)
+    update_run_list(root)
     return report
+
+
+def update_run_list(root: Path) -> None:
+    """Write the list of the runs below `RUNS` again where a run folder is one of them."""
+    if real(RUNS) in real(root).parents:
+        list_runs(RUNS)
+
+
+def list_runs(root: Path) -> Path | None:
+    """Write the list of the runs below a folder into it; see `write_run_list`."""
+    entries = find_runs([root])
+    finished = [
+        PastRun(entry.info, entry.summary) if entry.info and entry.summary else None
+        for entry in entries
+    ]
+    return write_run_list(root, entries, changes_between(finished))
 
 
 MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any other

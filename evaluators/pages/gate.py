@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.checksums import (
@@ -38,7 +39,7 @@ def write_gate(run: Run, verdict: GateVerdict, gate: str) -> Path:
         gate: Name or file of the gate.
     """
     path = run.folder / GATE_FILES[0]
-    write_json(path, sealed({"of": _content(run), "gate": gate} | verdict.as_dict()))
+    write_json(path, sealed({"of": _content(run.folder), "gate": gate} | verdict.as_dict()))
     state_files(run.folder, GATE_FILES)
     return path
 
@@ -56,11 +57,39 @@ def worst_of(checks: Sequence[JsonView]) -> list[JsonObject]:
     return list(pairs.values())
 
 
-def _content(run: Run) -> str:
+def _content(folder: Path) -> str:
     """Return the digest of the rollouts' table: a verdict on other rollouts is not shown."""
-    return str(
-        checksums_of(table_path(run.folder, ROLLOUTS).parent, [ROLLOUTS])[ROLLOUTS]["sha256"]
-    )
+    return str(checksums_of(table_path(folder, ROLLOUTS).parent, [ROLLOUTS])[ROLLOUTS]["sha256"])
+
+
+def _stored(folder: Path) -> JsonObject | None:
+    """Return ``gate.json`` of a run folder; None where there is none about these rollouts.
+
+    Raises:
+        InputError: It is damaged, or not what a gate wrote.
+    """
+    path = folder / GATE_FILES[0]
+    if not os.path.isfile(path):
+        return None
+    stored = read_json(path)
+    if stored["of"] != _content(folder):
+        return None
+    check_seal({DIGEST: None} | stored, path, "Give simrun gate again.")
+    return stored
+
+
+def gate_badge(folder: Path) -> tuple[str, str] | None:
+    """Return the verdict of the last gate that checked a run folder's rollouts, in words, and its
+    colour; None without one, and where it is damaged, as the run's own page says.
+    """
+    try:
+        stored = _stored(folder)
+    except InputError:
+        return None
+    if stored is None:
+        return None
+    cause = stored["outcome"]["cause"]
+    return WORDS[cause], tone_of_cause(cause)
 
 
 def gate_section(run: Run) -> JsonObject | None:
@@ -69,13 +98,9 @@ def gate_section(run: Run) -> JsonObject | None:
     Raises:
         InputError: gate.json is damaged, or not what a gate wrote.
     """
-    path = run.folder / GATE_FILES[0]
-    if not os.path.isfile(path):
+    stored = _stored(run.folder)
+    if stored is None:
         return None
-    stored = read_json(path)
-    if stored["of"] != _content(run):
-        return None
-    check_seal({DIGEST: None} | stored, path, "Give simrun gate again.")
     pages = {
         rollout.cell: run.href(rollout, WHY_NAME) or run.href(rollout) for rollout in run.rollouts
     }

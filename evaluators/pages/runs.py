@@ -24,7 +24,7 @@ from alpasim_plugin.log.run_folder.records import RunInfo, ScoreConfig, json_of
 from alpasim_plugin.log.run_folder.schema import LOCK, ROLLOUTS, RUN_INFO, SUMMARY, cell_name
 from evaluators.metrics import MetricTable
 from evaluators.results import Mean, Summary, read_summary
-from evaluators.statistics.numbers import DASH, printed
+from evaluators.statistics.numbers import DASH, plural, printed
 
 CHECK = "simrun check run RUN says what is damaged"
 
@@ -191,10 +191,10 @@ def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) 
         table.add_column(Text(escape(metric)), no_wrap=True, justify="right")
     for entry in entries:
         variants = entry.variants
-        names = [[escape(variant[axis]) for variant in variants] for axis in (0, 1)]
-        texts = [", ".join(dict.fromkeys(column)) for column in names]
+        parts = [[escape(variant[axis]) for variant in variants] for axis in (0, 1)]
+        texts = [", ".join(dict.fromkeys(column)) for column in parts]
         if metrics:
-            texts = ["\n".join(column) for column in names]
+            texts = ["\n".join(column) for column in parts]
             for metric in metrics:
                 texts.append("\n".join(value_text(entry, metric, *one) for one in variants))
         info = NO_INFO if entry.info is None else entry.info
@@ -203,12 +203,39 @@ def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) 
             Text(escape(os.path.relpath(entry.folder, root.parent)), style="bold"),
             Text(escape(began)),
             Text(escape(_commit(info))),
-            Text(f"{len(info.scenes)} x {len(info.seeds)} {escape(_first_scenario(info))}"),
+            Text(f"{len(info.scenes)} x {len(info.seeds)} {escape(first_scenario(info))}"),
             Text(escape(info.preset or DASH)),
             _state(entry),
             *(Text(text or DASH) for text in texts),
         )
     return table
+
+
+def run_paragraph(entry: RunEntry, root: Path, metrics: Sequence[str]) -> list[Text]:
+    """Lay out one run in lines, for a terminal in which `runs_table` would have to fold names.
+
+    Args:
+        entry: The run.
+        root: The folder that was searched; the name begins at the folder that holds it.
+        metrics: Names of metrics, each of which has a line for each variant.
+    """
+    info = NO_INFO if entry.info is None else entry.info
+    name = Text(escape(os.path.relpath(entry.folder, root.parent)), style="bold")
+    began = (info.started_at or DASH)[:16].replace("T", " ")
+    size = f"{plural(len(info.scenes), 'scene')} x {plural(len(info.seeds), 'seed')}"
+    scenes = f"{size} of {escape(first_scenario(info))}" if entry.info is not None else ""
+    facts = [began, scenes, escape(info.preset), f"commit {escape(_commit(info))}"]
+    state = Text("      ") + _state(entry)
+    if entry.state == "finished":
+        state += Text(" rollouts")
+    lines = [name, Text("      " + ", ".join(filter(None, facts))), state]
+    for renderer, policy in entry.variants:
+        variant = f"{escape(renderer)} / {escape(policy)}"
+        values = [f"{metric} {value_text(entry, metric, renderer, policy)}" for metric in metrics]
+        lines.append(
+            Text("      " + ": ".join([variant, *([", ".join(values)] if values else [])]))
+        )
+    return lines
 
 
 def _commit(info: RunInfo) -> str:
@@ -218,7 +245,7 @@ def _commit(info: RunInfo) -> str:
     return info.project.commit[:7] + ("+" if info.project.dirty else "")
 
 
-def _first_scenario(info: RunInfo) -> str:
+def first_scenario(info: RunInfo) -> str:
     """Return the first scenario that a command named, and how many more it named."""
     names = info.asked or tuple(info.scenes)
     if not names:
