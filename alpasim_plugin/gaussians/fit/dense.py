@@ -223,8 +223,11 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
             T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
             p = local @ T[:3, :3].T + T[:3, 3]
             ahead = np.maximum(p[:, 2], 1e-3)
-            x = np.floor((p[:, 0] / ahead * other.fx + other.cx) / STRIDE).astype(np.int64)
-            y = np.floor((p[:, 1] / ahead * other.fy + other.cy) / STRIDE).astype(np.int64)
+            # The nearest measured pixel, whose middle is half a pixel from its corner
+            u = p[:, 0] / ahead * other.fx + other.cx - 0.5
+            v = p[:, 1] / ahead * other.fy + other.cy - 0.5
+            x = np.rint(u / STRIDE).astype(np.int64)
+            y = np.rint(v / STRIDE).astype(np.int64)
             small = maps[i + gap][::STRIDE, ::STRIDE]
             inside = (
                 (p[:, 2] > 0.1) & (x >= 0) & (y >= 0) & (x < small.shape[1]) & (y < small.shape[0])

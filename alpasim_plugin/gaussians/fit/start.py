@@ -216,7 +216,9 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
     """Match points between each view and the next `NEIGHBOURS`: SIFT, nearest neighbours in both
     directions, ratio test.
     """
-    sift, matcher = cv2.SIFT_create(FEATURES), cv2.BFMatcher(cv2.NORM_L2)  # type: ignore[attr-defined]
+    # Without the precise scaling every point lies a quarter of a pixel too far right and down.
+    sift = cv2.SIFT_create(FEATURES, enable_precise_upscale=True)  # type: ignore[attr-defined]
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
     features = []
     for view in views:
         points, described = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)

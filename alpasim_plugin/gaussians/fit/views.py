@@ -12,6 +12,8 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
+AREA: F32 = np.array([0.25, 0.5, 0.25], dtype=np.float32)  # of a pixel of half the size, in pixels
+
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
@@ -119,34 +121,33 @@ def seen_from(
 
 
 def halved(view: PosedView) -> PosedView:
-    """Return a view of half the width and height; a pixel of it is sky, or counts, where all its
-    four do, and its depth is the first's.
+    """Return a view of half the width and height, whose pixels have their middles where every second
+    pixel of the view has them, in rows and columns: so the depth is that of those pixels.
+
+    A pixel shows the mean of an area of two by two pixels about its middle; it is sky, or counts,
+    where all that the area touches do.
     """
     camera = view.camera
     h = camera.height // 2
     w = camera.width // 2
+    every_second = slice(0, 2 * h, 2), slice(0, 2 * w, 2)
     K = camera.K.copy()
     K[:2] /= 2
-    rgb = cv2.resize(view.rgb[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
+    K[:2, 2] += 0.25  # the first pixel's middle, at 0.5 in both images
+    # Half of a pixel's neighbours lies in the area.
+    rgb = cv2.sepFilter2D(view.rgb, -1, AREA, AREA, borderType=cv2.BORDER_REPLICATE)
 
-    def all_four(flags: Bool | None) -> Bool | None:
-        return (
-            None
-            if flags is None
-            else np.asarray(
-                flags[: 2 * h, : 2 * w].reshape(h, 2, w, 2).all(axis=(1, 3)), dtype=np.bool_
-            )
-        )
+    def touched(flags: Bool | None) -> Bool | None:
+        if flags is None:
+            return None
+        whole = cv2.erode(flags.astype(np.uint8), np.ones((3, 3), dtype=np.uint8))
+        return np.asarray(whole[every_second] > 0, dtype=np.bool_)
 
-    depth = (
-        None if view.depth is None else np.ascontiguousarray(view.depth[: 2 * h : 2, : 2 * w : 2])
-    )
-    small = PinholeCamera(w, h, K, camera.T_camera_world)
     return replace(
         view,
-        camera=small,
-        rgb=rgb,
-        sky=all_four(view.sky),
-        mask=all_four(view.mask),
-        depth=depth,
+        camera=PinholeCamera(w, h, K, camera.T_camera_world),
+        rgb=np.ascontiguousarray(rgb[every_second]),
+        sky=touched(view.sky),
+        mask=touched(view.mask),
+        depth=None if view.depth is None else np.ascontiguousarray(view.depth[every_second]),
     )

@@ -9,11 +9,11 @@ import pytest
 
 from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.fit import drive
+from alpasim_plugin.gaussians.fit import dense, drive
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_near
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
-from alpasim_plugin.gaussians.fit.start import cloud_from_points
+from alpasim_plugin.gaussians.fit.start import cloud_from_points, matches
 from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
@@ -205,14 +205,73 @@ def test_a_held_out_photograph_has_the_gain_of_its_own_camera_s_neighbours(monke
 
 
 def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views):
-    depth = np.arange(views[0].rgb[..., 0].size, dtype=np.float32).reshape(views[0].rgb.shape[:2])
-    small = halved(replace(views[0], depth=depth, sky=depth > 100, gain=(1.1, 1.0, 0.9)))
+    flags = np.arange(views[0].rgb[..., 0].size).reshape(views[0].rgb.shape[:2]) > 100
+    small = halved(replace(views[0], sky=flags, gain=(1.1, 1.0, 0.9)))
     point = views[0].camera.centre_world + np.array([8.0, 1.0, 0.5])
     whole, half = (
         c.K @ (c.T_camera_world[:3, :3] @ point + c.T_camera_world[:3, 3])
         for c in (views[0].camera, small.camera)
     )
-    assert np.allclose(whole[:2] / whole[2], 2 * half[:2] / half[2])
-    assert small.depth[1, 1] == depth[2, 2]
+    middle = 0.5  # of the first pixel, in both
+    assert np.allclose(whole[:2] / whole[2] - middle, 2 * (half[:2] / half[2] - middle))
     assert [bool(flag) for flag in small.sky[:2, 50]] == [False, True]
     assert small.gain == (1.1, 1.0, 0.9)
+
+
+def test_colours_and_depth_of_a_halved_view_are_those_of_a_slope_at_the_middle_of_its_pixels():
+    """Both follow the rays' slope downwards, as those of a road do."""
+
+    def slopes(camera):
+        return np.repeat((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy, camera.width)
+
+    camera = PinholeCamera(80, 60, intrinsics(100.0, 100.0, 41.0, 5.0), np.eye(4))
+    depth = (1 / (0.1 + 0.2 * slopes(camera))).astype(np.float32).reshape(60, 80)
+    levels = np.rint(100 + 200 * slopes(camera)).astype(np.uint8).reshape(60, 80, 1)
+    small = halved(PosedView(camera, np.repeat(levels, 3, axis=2), depth=depth))
+    assert small.rgb.shape == (30, 40, 3)
+    true = 1 / (0.1 + 0.2 * slopes(small.camera))
+    np.testing.assert_allclose(small.depth.ravel(), true, rtol=1e-6)
+    inner = slice(1, None)  # above the first row there is nothing to take the mean of
+    shade = (100 + 200 * slopes(small.camera)).reshape(30, 40)
+    assert np.abs(small.rgb[inner, :, 0] - shade[inner]).max() < 1.0
+
+
+@pytest.mark.parametrize("along", ["rows", "columns"])
+def test_depth_on_a_steep_slope_is_confirmed_by_the_nearest_pixel_of_a_neighbour(along):
+    """Depth falls by 5 % from pixel to pixel; the second view is shifted by 1.4 of them."""
+    views = []
+    maps = []
+    for shift_px in (0.0, 1.4):
+        depth = np.repeat((10.0 * 0.95 ** (np.arange(40) - shift_px))[:, None], 40, axis=1)
+        K = intrinsics(50.0, 50.0, 20.0, 20.0 + shift_px)
+        if along == "columns":
+            depth = depth.T
+            K = intrinsics(50.0, 50.0, 20.0 + shift_px, 20.0)
+        camera = PinholeCamera(40, 40, K, np.eye(4))
+        views.append(PosedView(camera, np.zeros((40, 40, 3), dtype=np.uint8)))
+        measured = np.zeros((40, 40), dtype=np.float32)
+        measured[::STRIDE, ::STRIDE] = depth[::STRIDE, ::STRIDE]
+        maps.append(measured)
+    np.testing.assert_array_equal(dense._agreed(views, maps, 0), maps[0])
+
+
+def test_matched_points_lie_where_the_photographs_show_them():
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[0:160, 0:160] + 0.5
+    middles = np.array([[20 + 40 * (i % 4), 20 + 40 * (i // 4)] for i in range(16)])
+    middles = middles + rng.uniform(0, 1, (16, 2))
+    grey = np.full((160, 160), 60.0)
+    for i, (x, y) in enumerate(middles):
+        shape = np.hypot(columns - x, (1 + 0.02 * i) * (rows - y)) / (2 + 0.1 * i)
+        grey += 150 * np.exp(-0.5 * shape**2)
+    rgb = np.repeat(np.rint(grey)[..., None], 3, axis=2).astype(np.uint8)
+    camera = PinholeCamera(160, 160, intrinsics(100.0, 100.0, 80.0, 80.0), np.eye(4))
+    pairs = matches([PosedView(camera, rgb), PosedView(camera, rgb)])
+    errors = []
+    for match in pairs:
+        away = match.at_first - middles
+        nearest = away[np.argmin(np.hypot(*away.T))]
+        if np.hypot(*nearest) < 1.0:
+            errors.append(nearest)
+    assert len(errors) > 10
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.05
