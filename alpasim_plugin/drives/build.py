@@ -461,7 +461,8 @@ def _camera(drive: SourceDrive, placed: PlacedDrive, name: str) -> CameraSpec:
 
 def _name_of(drive: SourceDrive, camera: str) -> str:
     """Return the name of a camera in the scenario, where the one that looks ahead is a front."""
-    return camera if camera != drive.front or "front" in camera else "front"
+    is_named = "front" in camera or "front" in drive.cameras
+    return "front" if camera == drive.front and not is_named else camera
 
 
 def scene_id_of(drive: SourceDrive) -> str:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import natural_order, read_bytes, real
@@ -26,7 +25,7 @@ from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.files.reading import parsing
 from alpasim_plugin.core.geometry import inverse, se3
 from alpasim_plugin.core.types import F64
-from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, timed
+from alpasim_plugin.drives.source import PERIOD_US, Points, SourceDrive, front_camera, timed
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph
 
@@ -37,7 +36,6 @@ IMAGES = ("images", "", "../images", "../../images")
 CAMERA = 0  # the kind of a sensor that takes images
 T = TypeVar("T")
 UNIT = 1e-2  # how far from 1 the length of a quaternion may be
-SPREAD = 0.004  # of a point, as a share of its distance from the nearest camera
 # Lens models in the order of their numbers; those without a count in `PARAMETERS` are refused.
 _NAMES = """SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV
     SIMPLE_RADIAL_FISHEYE RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE"""
@@ -144,7 +142,7 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
     ]
     names = sorted(shots)
     usual = [*names_of_reference, *names][0]
-    front = next((name for name in names if "front" in name), usual)
+    front = front_camera({name: shots[name] for name in (usual, *names)})
     cameras = [shots[name] for name in names]
     photographs = [shot for camera in cameras for shot in camera] if times_us else timed(cameras)
     points = _points(model, photographs)
@@ -193,6 +191,11 @@ def _shots(
             {},
         )
         shots.setdefault(name, []).append(shot)
+    if (
+        times_us
+    ):  # by the names of the reference camera's images: those of another may run otherwise
+        for camera in shots.values():
+            camera.sort(key=lambda shot: int(shot.t_us or 0))
     return shots
 
 
@@ -213,15 +216,9 @@ def _largest_model(folder: Path) -> tuple[Path, list[_Image], list[str]]:
 
 
 def _points(model: Path, photographs: Sequence[PosedPhotograph]) -> Points:
-    """Return the points of a model; how far each may be off grows with its distance from the nearest
-    photograph.
-    """
+    """Return the points of a model; their errors in pixels say nothing of their distance."""
     table = np.array(_records(model, "points3D", _point)).reshape(-1, 6)
-    centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
-    sampled_centres = centres[:: max(1, len(centres) // 32)]
-    distance = scipy.spatial.KDTree(sampled_centres).query(table[:, :3])[0]
-    spread = np.eye(3) * ((SPREAD * distance) ** 2)[:, None, None]
-    return Points(table[:, :3], table[:, 3:] / 255.0, spread)
+    return Points.of_unstated_error(table[:, :3], table[:, 3:] / 255.0, photographs)
 
 
 def _rig_times(

@@ -15,7 +15,7 @@ from alpasim_plugin.drives.colmap import models_in, read_colmap
 from alpasim_plugin.drives.kitti import is_kitti, read_kitti
 from alpasim_plugin.drives.points import agreeing
 from alpasim_plugin.drives.py123d import SYNC_FILE, read_py123d
-from alpasim_plugin.drives.source import Points, SourceDrive, in_order, timed
+from alpasim_plugin.drives.source import Points, SourceDrive, front_camera, in_order, timed
 from alpasim_plugin.gaussians.fit.photographs import (
     AXES,
     FILE,
@@ -82,14 +82,18 @@ def _transforms(folder: Path, need_files: bool) -> SourceDrive:
     with_times, time_notes = _with_times(with_cameras, names)
     photographs = [photograph for photograph in with_times if photograph.file in files]
     photographs.sort(key=lambda photograph: (str(photograph.camera), int(photograph.t_us or 0)))
+    never_fitted = _never_fitted(photographs)
+    shots = {name: [shot for shot in photographs if shot.camera == name] for name in names}
     return SourceDrive(
         "transforms",
         real(folder).name,
         tuple(photographs),
-        front=next((name for name in names if "front" in name), names[0]),
-        never_fitted=_never_fitted(photographs),
+        front=front_camera(
+            {name: shots[name] for name in names if name not in never_fitted} or shots
+        ),
+        never_fitted=never_fitted,
         metric=_unit_source(folder, document),
-        points=_start_points(folder, document) if need_files else None,
+        points=_start_points(folder, document, photographs) if need_files else None,
         notes=(*axes_notes, *_file_notes(listed, missing), *time_notes),
     )
 
@@ -218,7 +222,9 @@ def _unit_source(folder: Path, document: JsonObject) -> str | None:
     return "the file's word that its unit is the metre" if unit else None
 
 
-def _start_points(folder: Path, document: JsonObject) -> Points | None:
+def _start_points(
+    folder: Path, document: JsonObject, photographs: Sequence[PosedPhotograph]
+) -> Points | None:
     """Return the points, with colours, that the file names; None where it names none."""
     name = document.get("ply_file_path")
     if name is None:
@@ -227,7 +233,7 @@ def _start_points(folder: Path, document: JsonObject) -> Points | None:
     cloud = read_points(path)
     rgb = np.clip(0.5 + C0 * cloud.sh[:, 0], 0, 1)
     xyz = np.asarray(cloud.means, dtype=np.float64)
-    return Points(xyz, rgb, np.zeros((len(cloud), 3, 3)))
+    return Points.of_unstated_error(xyz, rgb, photographs)
 
 
 def recognised_axes(folder: Path, photographs: Sequence[PosedPhotograph]) -> tuple[str, str]:

@@ -102,6 +102,11 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         notes.append(
             f"the front camera is taken to stand {AHEAD_OF_AXLE_M:g} m ahead of the rear axle"
         )
+    notes += [
+        f"camera {name} took no photograph while {drive.front} did: where it stands is not known, and the scenario has no such camera"
+        for name in drive.cameras
+        if name not in mounts
+    ]
     if strip is None:
         notes.append(
             f"the ground below the path was not seen: it is taken {height:g} m below the camera. Renderers can be measured by these "

@@ -25,7 +25,7 @@ from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, BODY_M
 from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Actor, Box, Trajectory, Vehicle
-from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive
+from alpasim_plugin.drives.source import PHOTOGRAPHS, SourceDrive, front_camera
 from alpasim_plugin.gaussians.fit.lens import FROM_CORNER, Lens
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, rigid_pose
 from scenarios.recorded import actors_of_track, checked_trajectory
@@ -101,13 +101,13 @@ def read_py123d(folder: Path) -> SourceDrive:
     notes: list[str] = []
     keys = sorted(path.stem for path in folder.glob("*.arrow"))
     cameras = _cameras(folder, keys, ego, notes)
-    front = next((name for name in FRONT if name in cameras), min(cameras))
+    front = next((name for name in FRONT if name in cameras), front_camera(cameras))
     last_us = int(cameras[front][: int(PHOTOGRAPHS.high)][-1].t_us or 0)
     photographs = [shot for shots in cameras.values() for shot in shots]
     chosen = tuple(shot for shot in photographs if int(shot.t_us or 0) <= last_us)
     if len(chosen) < len(photographs):
         notes.append(
-            f"{len(photographs) - len(chosen)} photographs after the first of {front} left out"
+            f"{len(photographs) - len(chosen)} photographs after the last that is read of {front} left out"
         )
     actors = _actors(folder, notes) if BOXES in keys else ()
     notes += PY123D.notes(_met(folder, keys))
@@ -234,14 +234,21 @@ def _camera(folder: Path, key: str, ego: Trajectory, notes: list[str]) -> list[P
             raise ValueError("times that do not increase")
         of_ego = interpolate(ego, t_us.clip(ego.t_us[0], ego.t_us[-1]))
         poses = of_ego @ _T(facts["camera_to_imu_se3"])
+        has_ego = (t_us >= ego.t_us[0]) & (t_us <= ego.t_us[-1])
         images = _images(path, data)
         photographs = []
+        unposed = 0
         for i, (image, pose) in enumerate(zip(images, stated.to_pylist(), strict=True)):
+            if pose is None and not has_ego[i]:
+                unposed += 1
+                continue
             location = f"{path}, row {i}"
             T = rigid_pose((poses[i] if pose is None else _T(pose)).tolist(), location)
             photographs.append(
                 PosedPhotograph(image.file, lens, T, location, int(t_us[i]), name, {}, image.data)
             )
+    if unposed:
+        notes.append(f"{name}: {unposed} photographs before or after the ego's poses left out")
     return photographs
 
 

@@ -5,12 +5,13 @@ checks that all of them pass.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import natural_order
@@ -26,6 +27,10 @@ PHOTOGRAPHS = Bound("photographs with poses", "", 8, 400, "give a drive, or a pa
 PERIOD_US = 100_000  # between photographs without times
 LONGEST = 36_000  # steps between the numbers of names that count time: an hour
 SAME_LENGTH = 0.01  # paths that differ by less are equally long
+# Cosines with the way that differ by less look alike along it: 25 degrees are as good as none
+ALIKE = 0.1
+# Of points whose error is not stated, as a share of their distance from the nearest photograph
+SPREAD = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +50,18 @@ class Points:
     def __len__(self) -> int:
         """Return how many there are."""
         return len(self.xyz)
+
+    @classmethod
+    def of_unstated_error(
+        cls, xyz: F64, rgb: F64, photographs: Sequence[PosedPhotograph]
+    ) -> Points:
+        """Return points ``(N, 3)`` with colours ``(N, 3)`` 0..1; how far each may be off grows with
+        its distance from the nearest photograph.
+        """
+        centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
+        sampled_centres = centres[:: max(1, len(centres) // 32)]
+        distance = scipy.spatial.KDTree(sampled_centres).query(xyz)[0]
+        return cls(xyz, rgb, np.eye(3) * ((SPREAD * distance) ** 2)[:, None, None])
 
     def moved(self, T: F64) -> Points:
         """Return them in another frame; ``(4, 4)``, may scale."""
@@ -123,6 +140,30 @@ class SourceDrive:
     def path(self) -> F64:
         """Return where the front camera was, ``(N, 3)``."""
         return np.array([photograph.T_world_camera[:3, 3] for photograph in self.of(self.front)])
+
+
+def front_camera(cameras: Mapping[str, Sequence[PosedPhotograph]]) -> str:
+    """Return the camera to drive by: the first of those that look along the way as well as any; of
+    those with a front in their name, where there are some.
+
+    Args:
+        cameras: Name to photographs, as they were taken; the preferred ones first.
+    """
+    names = [name for name in cameras if "front" in name.lower()] or list(cameras)
+    ahead = {name: _ahead(cameras[name]) for name in names}
+    best = max(ahead.values())
+    return next(name for name in names if ahead[name] >= best - ALIKE)
+
+
+def _ahead(photographs: Sequence[PosedPhotograph]) -> float:
+    """Return the cosine between a camera's axis and the way it goes, the mean by length; 0 of a
+    camera that stands.
+    """
+    poses = np.array([photograph.T_world_camera for photograph in photographs])
+    steps = np.diff(poses[:, :3, 3], axis=0)
+    length = float(np.linalg.norm(steps, axis=1).sum())
+    along = float(np.einsum("ij,ij->", steps, poses[:-1, :3, 2]))
+    return along / length if length else 0.0
 
 
 def checked(drive: SourceDrive, folder: Path, need_files: bool = True) -> SourceDrive:

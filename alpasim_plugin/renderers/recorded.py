@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.cameras.lens import lens_camera
-from alpasim_plugin.core.files.images import read_image
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.images import AS_STORED, read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, rigid, shifted
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Photograph, RecordedFrame, Scenario
@@ -170,9 +171,14 @@ def photograph_image(photograph: Photograph, camera: PinholeCamera) -> U8:
     """Read a photograph at the size of its camera ``(H, W, 3)``.
 
     Raises:
-        InputError: The file is missing or damaged.
+        InputError: The file is missing, damaged or of another size.
     """
-    rgb = read_image(Path(photograph.path))[..., ::-1]
+    rgb = read_image(Path(photograph.path), AS_STORED)[..., ::-1]
+    if rgb.shape[:2] != (photograph.height, photograph.width):
+        raise InputError(
+            f"{photograph.path}: {rgb.shape[1]}x{rgb.shape[0]} pixels, the scenario says {photograph.width}x{photograph.height}",
+            "give the photograph as it was imported",
+        )
     size = camera.width, camera.height
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return np.ascontiguousarray(small, dtype=np.uint8)

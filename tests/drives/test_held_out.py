@@ -14,8 +14,9 @@ from alpasim_plugin.core.geometry import interpolate, inverse, se2, trajectory_f
 from alpasim_plugin.drives import build, quality
 from alpasim_plugin.drives.build import import_drive
 from alpasim_plugin.drives.held_out import EVERY
+from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.points import moved_rig, with_corrected_poses
-from alpasim_plugin.drives.source import SourceDrive
+from alpasim_plugin.drives.source import Points, SourceDrive
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.drive import fit_drive
 from alpasim_plugin.gaussians.fit.lens import Lens
@@ -113,9 +114,8 @@ def street_drive(count=9, unlike=(), shaken_m=0.03):
                 T[:3, :3] = looks_left @ T[:3, :3]
             T[1:3, 3] += shaken_m * np.array([np.sin(t_us * 1e-5), np.cos(t_us * 8e-6)])
             data = memoryview(cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes())
-            place = f"{camera}, {i}"
             file = Path(f"{camera}/{i:06d}.png")
-            photographs.append(PosedPhotograph(file, lens, T, place, t_us, camera, {}, data))
+            photographs.append(PosedPhotograph(file, lens, T, str(file), t_us, camera, {}, data))
     return SourceDrive("transforms", "rig", tuple(photographs), "front", ("left",), "metres")
 
 
@@ -197,6 +197,17 @@ def test_a_photograph_before_the_first_of_the_front_camera_moves_as_that_one():
     first = moved.of("left")[0].T_world_camera - drive.of("left")[0].T_world_camera
     assert first[:3, 3] == pytest.approx([0.0, -0.2, 0.0])
     assert np.allclose(first[:3, :3], 0)
+
+
+def test_a_camera_whose_place_on_the_rig_is_not_known_is_said():
+    front_us = np.arange(8) * 100_000
+    none = Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    beside = place(rig_drive(front_us, front_us + 12_000), none)
+    assert "left" in beside.mounts
+    assert "camera left" not in str(beside.notes)
+    later = place(rig_drive(front_us, front_us + 900_000), none)
+    assert "left" not in later.mounts
+    assert "camera left took no photograph while front did" in str(later.notes)
 
 
 def test_a_held_out_photograph_is_compared_in_the_exposure_of_its_own_camera(monkeypatch):

@@ -51,6 +51,28 @@ def test_images_are_read_however_they_are_kept(tmp_path, log, codec):
     assert one.T_world_camera[:2, 3] == pytest.approx(ORIGIN[:2] + np.array([3.0, 0.0]), abs=0.1)
 
 
+def test_photographs_without_a_pose_of_their_own_need_one_of_the_ego_at_their_time(log, tmp_path):
+    folder = shutil.copytree(log, tmp_path / "log")
+    ego = folder / "ego_state_se3.arrow"
+    rewritten(ego, pa.ipc.open_file(pa.BufferReader(ego.read_bytes())).read_all().slice(2, 19))
+    camera = folder / "camera.pcam_f0.arrow"
+    table = pa.ipc.open_file(pa.BufferReader(camera.read_bytes())).read_all()
+    name = "camera.pcam_f0.camera_to_global_se3"
+    column = table.schema.get_field_index(name)
+    field = table.schema.field(column)
+    rewritten(camera, table.set_column(column, field, pa.nulls(COUNT, field.type)))
+    drive = read_source(folder)
+    assert len(drive.photographs) == 19
+    assert "pcam_f0: 5 photographs before or after the ego's poses" in str(drive.notes)
+
+
+def rewritten(path, table):
+    """Write a table over a file, with its schema's metadata."""
+    path.unlink()
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(table)
+
+
 @pytest.mark.slow
 def test_an_imported_log_drives_with_its_road_user(log, tmp_path, quick_fit):
     import_drive(log, tmp_path / "out")

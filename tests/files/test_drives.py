@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import quat_from_matrix
+from alpasim_plugin.core.geometry import quat_from_matrix, se2
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import check_motion, place
 from alpasim_plugin.drives.quality import _page
 from alpasim_plugin.drives.source import Points, checked
 from alpasim_plugin.drives.splat import _in_frame
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
+from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.quality import Comparison
 from scenarios.sources import import_advice
 from tests.drives.street import FOCAL, HEIGHT, WIDTH, Street, edited
@@ -502,6 +503,16 @@ def test_images_of_a_frame_of_a_rig_have_one_time(tmp_path, folders, binary):
     assert np.allclose(mount, np.linalg.inv(SIDE), atol=1e-9)
 
 
+def test_photographs_of_a_rig_are_in_the_order_of_time_whatever_their_names(tmp_path):
+    model = rig(tmp_path / "sparse/0", ["front/", "left/"], range(13))
+    text = (model / "images.txt").read_text()
+    backwards = re.sub(r"left/(\d+)", lambda name: f"left/{20 - int(name[1])}", text)
+    (model / "images.txt").write_text(backwards)
+    drive = read_source(tmp_path, need_files=False)
+    assert [one.t_us for one in drive.of("left")] == [100_000 * i for i in range(13)]
+    assert [one.file.name for one in drive.of("left")][:2] == ["20.png", "19.png"]
+
+
 @pytest.mark.parametrize("binary", [False, True])
 def test_images_that_do_not_stand_where_their_rig_says_are_refused(tmp_path, binary):
     rig(tmp_path / "sparse/0", ["front/", "left/"], [0, 1], binary, shift=0.2)
@@ -556,6 +567,47 @@ def test_rigs_of_one_camera_change_nothing(tmp_path):
     pose = " ".join(first_image.split()[1:8])
     (model / "frames.txt").write_text(f"4 1 {pose} 1 CAMERA 7 1\n")
     assert along(read_source(tmp_path, need_files=False)) == STRAIGHT
+
+
+def turned_rig(folder, turns_deg, **uses):
+    """Write a ``transforms.json`` of cameras that look to the left by so many degrees."""
+    frames = []
+    for camera, turn_deg in turns_deg.items():
+        for i, pose in enumerate(poses(10)):
+            pose[:3, :3] = se2(0, 0, np.radians(turn_deg))[:3, :3] @ pose[:3, :3]
+            frame = {"file_path": f"{camera}/{i}.png", "transform_matrix": pose.tolist()}
+            use = {"use": uses[camera]} if camera in uses else {}
+            frames.append({**frame, "camera": camera, "t_us": 100_000 * i, **use})
+    folder.mkdir(parents=True)
+    document = {"axes": "opencv", **LENS, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("turns_deg", "uses", "front"),
+    [
+        ({"CAM_BACK": 180, "CAM_FRONT": 0, "CAM_FRONT_LEFT": 55}, {}, "CAM_FRONT"),
+        ({"FRONT": 0, "FRONT_LEFT": 45, "SIDE_LEFT": 90}, {}, "FRONT"),
+        ({"front_left": 60, "front_wide": 2, "rear": 180}, {}, "front_wide"),
+        ({"cam0": 90, "cam1": 3, "cam2": 0}, {}, "cam1"),
+        ({"left": 0, "right": 0}, {"left": "never-fitted"}, "right"),
+    ],
+)
+def test_a_rig_is_driven_by_the_camera_that_looks_ahead(tmp_path, turns_deg, uses, front):
+    folder = turned_rig(tmp_path / "rig", turns_deg, **uses)
+    assert read_source(folder, need_files=False).front == front
+
+
+def test_points_of_a_file_are_as_uncertain_as_they_are_far_away(tmp_path):
+    folder = transforms(tmp_path / "a", NAMES, ply_file_path="points.ply")
+    (folder / "images").mkdir()
+    for name in NAMES:
+        cv2.imwrite(str(folder / "images" / name), np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))
+    xyz = poses(1)[0][:3, 3] + np.array([[0.0, 5.0, 0.0], [0.0, 50.0, 0.0]])
+    write_points(folder / "points.ply", xyz, np.zeros((2, 3), dtype=np.uint8))
+    points = read_source(folder).points
+    assert points.spread == pytest.approx(np.sqrt(3) * 0.004 * np.array([5.0, 50.0]))
 
 
 def test_a_file_without_frames_is_refused(tmp_path):

@@ -16,6 +16,9 @@ GIVE = "give a whole PNG or JPEG image"
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 CMYK_CHANNELS = 4
+# cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION: in colour, and turned by no EXIF tag, because poses
+# and lenses of photographs are those of their pixels as they lie in the file
+AS_STORED = 1 | 128
 # JPEG markers that carry the size, and those that have no length
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 BARE = {0x01, *range(0xD0, 0xD9)}

@@ -360,7 +360,8 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         for name, T in sorted(view.actors.items()):
             digest.update(name.encode())
             add(T)
-    for cloud in (start.background, *(c for _, c in sorted(start.actors.items()))):
-        for part in (cloud.means, cloud.scales, cloud.sh):
+    for name, cloud in (("", start.background), *sorted(start.actors.items())):
+        digest.update(name.encode())
+        for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh):
             add(part)
     return digest.hexdigest()

@@ -31,7 +31,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_bytes, read_json_object
 from alpasim_plugin.core.files.fields import Fields, field_name
-from alpasim_plugin.core.files.images import check_image, decode_image, image_fault
+from alpasim_plugin.core.files.images import AS_STORED, check_image, decode_image, image_fault
 from alpasim_plugin.core.files.limits import SOURCE_BYTES
 from alpasim_plugin.core.files.reading import as_shape
 from alpasim_plugin.core.json_types import JsonObject
@@ -140,8 +140,7 @@ class PosedPhotograph:
         Raises:
             InputError: See `encoded`.
         """
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        bgr = decode_image(self.encoded(), f"{self.location}, {self.file}", WHOLE, flags)
+        bgr = decode_image(self.encoded(), f"{self.location}, {self.file}", WHOLE, AS_STORED)
         return np.ascontiguousarray(
             self.lens.straightened(np.asarray(bgr, dtype=np.uint8)[..., ::-1])
         )

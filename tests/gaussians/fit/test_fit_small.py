@@ -82,6 +82,10 @@ def test_a_folder_begun_with_another_recipe_is_refused(posed, tmp_path):
         fit(posed.views, posed.start, replace(recipe, lr_scales=0.1), folder=tmp_path)
     with pytest.raises(InputError):
         fit(posed.views[1:], posed.start, recipe, folder=tmp_path)
+    background = posed.start.background
+    fainter = replace(background, opacities=background.opacities / 2)
+    with pytest.raises(InputError):
+        fit(posed.views, replace(posed.start, background=fainter), recipe, folder=tmp_path)
 
 
 def test_the_actor_is_learned_in_its_own_frame(posed):
