@@ -54,6 +54,8 @@ HEIGHTS_M = {
 }
 
 VERSIONS = ("2018b", "2020a")
+NO_SMALLER = 0.95  # a turned box of more than this share of the one along the frame is not used
+ROUND = 0.35  # a box around a circle is by 4 / pi - 1 = 0.27 larger, and no note needs to say it
 DEFAULT = Vehicle()
 
 
@@ -86,6 +88,7 @@ def read_obstacles(path: Path, root: Element) -> tuple[list[Obstacle], list[str]
     """
     obstacles: dict[str, Obstacle] = {}
     skipped: Counter[str] = Counter()
+    larger: list[float] = []
     for element in root:
         if element.tag not in ("obstacle", "staticObstacle", "dynamicObstacle"):
             continue
@@ -103,7 +106,13 @@ def read_obstacles(path: Path, root: Element) -> tuple[list[Obstacle], list[str]
             if key in obstacles:
                 raise ValueError("its id stands twice")
             obstacles[key] = _obstacle(element, key, static, states, location)
+            larger.append(_larger(element))
     notes = [f"{n} obstacles {why} and were left out" for why, n in sorted(skipped.items())]
+    too_large = [share for share in larger if share > ROUND]
+    if too_large:
+        notes.append(
+            f"{len(too_large)} obstacles are taken as the box around their shape, which is up to {max(too_large):.0%} larger"
+        )
     for tag in ("environmentObstacle", "phantomObstacle"):
         count = len(root.findall(tag))
         if count:
@@ -142,12 +151,17 @@ def _bounding_box(
     """Return (length, width), the box centre in the obstacle's frame, and the box's turn against
     it.
 
-    A single rectangle is kept as it is; circles, polygons and groups of shapes become the box
-    around them.
+    A single rectangle is kept as it is; circles, polygons and groups of shapes become the smallest
+    box around them, along the obstacle's frame where a turned one is no smaller.
     """
     parts = obstacle.findall("shape/*")
     if len(parts) == 1 and parts[0].tag == "rectangle":
         return _rectangle(parts[0])
+    return _box_around(_area(parts))
+
+
+def _area(parts: list[Element]) -> shapely.Geometry:
+    """Return what the parts of a shape cover, in the obstacle's frame."""
     areas = []
     for part in parts:
         if part.tag == "circle":
@@ -160,10 +174,34 @@ def _bounding_box(
             areas.append(shapely.affinity.rotate(box, turn, use_radians=True))
         else:
             raise ValueError(f"shape {part.tag!r}, neither rectangle nor circle nor polygon")
-    left, low, right, high = shapely.total_bounds(areas).tolist()
+    return shapely.MultiPolygon(areas)
+
+
+def _box_around(area: shapely.Geometry) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return (length, width), the centre and the turn, at most 45 degrees, of a box around an area."""
+    left, low, right, high = area.bounds
     if not (right > left and high > low):
         raise ValueError(f"a shape of {right - left} x {high - low} m")
-    return (right - left, high - low), ((left + right) / 2, (low + high) / 2), 0.0
+    turned = shapely.oriented_envelope(area)
+    if turned.area > NO_SMALLER * (right - left) * (high - low):
+        return (right - left, high - low), ((left + right) / 2, (low + high) / 2), 0.0
+    corners = shapely.get_coordinates(turned)
+    sides = np.diff(corners[:3], axis=0)
+    along = int(np.argmax(np.abs(sides[:, 0]) / np.linalg.norm(sides, axis=1)))
+    length, width = (float(np.linalg.norm(sides[k])) for k in (along, 1 - along))
+    turn = float(np.arctan2(sides[along, 1], sides[along, 0]))
+    turn = (turn + np.pi / 2) % np.pi - np.pi / 2
+    return (length, width), (float(turned.centroid.x), float(turned.centroid.y)), turn
+
+
+def _larger(obstacle: Element) -> float:
+    """Return how much larger than an obstacle's shape its box is, as a share of the shape."""
+    parts = obstacle.findall("shape/*")
+    if len(parts) == 1 and parts[0].tag == "rectangle":
+        return 0.0
+    area = _area(parts)
+    (length, width), _, _ = _box_around(area)
+    return float(length * width / shapely.union_all(area.geoms).area) - 1.0
 
 
 def _rectangle(part: Element) -> tuple[tuple[float, float], tuple[float, float], float]:

@@ -5,7 +5,7 @@ from alpasim_plugin.core.files.fields import Fields
 _POINT = {"point": "x y z"}
 _STATE = "position orientation time"
 _MOTION = """velocity acceleration yawRate slipAngle steeringAngle steeringAngleSpeed jerk curvature
-    velocityY accelerationY"""  # that of the positions is taken
+    velocityY accelerationY frontWheelAngularSpeed rearWheelAngularSpeed"""  # that of the positions is taken
 _OBSTACLE = "@id type shape initialState trajectory"
 _BOUND = "point lineMarking"
 COMMONROAD = Fields(
@@ -14,7 +14,8 @@ COMMONROAD = Fields(
         "commonRoad": """@commonRoadVersion @benchmarkID @timeStepSize lanelet trafficSign
             trafficLight obstacle staticObstacle dynamicObstacle""",
         "lanelet": """@id leftBound rightBound predecessor successor adjacentLeft adjacentRight
-            stopLine laneletType trafficSignRef trafficLightRef speedLimit""",
+            stopLine laneletType trafficSignRef trafficLightRef speedLimit userOneWay
+            userBidirectional""",
         "leftBound": _BOUND,
         "rightBound": _BOUND,
         "stopLine": "point trafficLightRef",
@@ -45,7 +46,6 @@ COMMONROAD = Fields(
         # Named by notes of their own: the planning problem, and obstacles without a track.
         "commonRoad": """@author @affiliation @source @date @tags planningProblem
             environmentObstacle phantomObstacle scenarioTags location intersection""",
-        "lanelet": "userOneWay userBidirectional",
         "predecessor": "@ref",
         "stopLine": "lineMarking trafficSignRef",
         "trafficSign": "position virtual",

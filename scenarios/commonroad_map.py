@@ -1,8 +1,8 @@
 """Lanelets of a CommonRoad file (versions 2018b and 2020a) as a lane map."""
 
-import contextlib
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,18 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.geometry import centre_line, heading_of
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Signal
-from scenarios.map_lines import border_lines, is_left_of, lane_edges, merge_areas, predecessors
+from scenarios.map_lines import (
+    MEET_M,
+    border_lines,
+    is_left_of,
+    lane_edges,
+    merge_areas,
+    predecessors,
+)
 from scenarios.recorded import near
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
@@ -44,12 +51,15 @@ COLOURS = {
 # Phases in microseconds, and when the first begins.
 Cycle = tuple[tuple[tuple[str, int], ...], int]
 KINDS = {"shoulder": "shoulder", "busLane": "bus", "bicycleLane": "bike", "parking": "parking"}
+CARS = {"vehicle", "car", "taxi"}  # among the users that a lanelet may name
 NOT_FOR_CARS = {"sidewalk", "crosswalk"}
 _FOR_CARS = """urban interstate country highway exitRamp accessRamp mainCarriageWay driveWay
     intersection busStop"""
 TYPES = {*KINDS, *NOT_FOR_CARS, *_FOR_CARS.split()}
-# German and US maximum speed; the additional value is in m/s.
-MAX_SPEED_SIGNS = ("274", "R2-1")
+# Maximum speed in the countries of CommonRoad, as its documentation numbers the signs.
+MAX_SPEED_SIGNS = ("274", "R2-1", "R15", "C43", "B31", "B14", "\u03a1-32", "3.24", "r301")
+# The additional value is in m/s unless it states another unit.
+SPEED_UNITS_MPS = {"": 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "mph": 0.44704}
 # A lanelet covered to this share by lanelets it is not linked to lies in an intersection.
 CROSSING_SHARE = 0.1
 
@@ -75,14 +85,26 @@ class Lanelet:
     right: F64
 
     @property
-    def is_for_cars(self) -> bool:
-        """Return whether vehicles may drive on it."""
-        return not any(name in NOT_FOR_CARS for name in self.types)
+    def users(self) -> set[str]:
+        """Return the road users that it is for, in one direction or both; none where it names none."""
+        named = [*self.element.findall("userOneWay"), *self.element.findall("userBidirectional")]
+        return {str(user.text) for user in named}
 
     @property
-    def has_exchanged_bounds(self) -> bool:
-        """Return whether the file names the left bound right and the right bound left."""
-        return is_left_of(self.right, self.left)
+    def kind(self) -> str | None:
+        """Return the kind of its lane; None where no vehicle drives on it."""
+        if NOT_FOR_CARS & {*self.types}:
+            return None
+        by_type = next((KINDS[name] for name in self.types if name in KINDS), None)
+        if by_type is not None or not self.users or self.users & CARS:
+            return by_type or "vehicle"
+        if self.users <= {"pedestrian", "train"}:
+            return None
+        return "bike" if self.users <= {"bicycle", "pedestrian"} else "bus"
+
+    def linked(self, tag: str) -> list[str]:
+        """Return the ids of its successors or predecessors."""
+        return [str(link.get("ref")) for link in self.element.findall(tag)]
 
 
 def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tuple[str, ...]]:
@@ -94,7 +116,12 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
     signs = _speed_signs(root)
     lights, light_notes = _traffic_lights(path, root)
     lanelets = [_lanelet(path, element, origin) for element in root.findall("lanelet")]
-    roads = [_with_bounds_in_order(lanelet) for lanelet in lanelets if lanelet.is_for_cars]
+    exchanged = _exchanged([lanelet for lanelet in lanelets if lanelet.kind is not None])
+    roads = [
+        _with_bounds_in_order(lanelet, exchanged)
+        for lanelet in lanelets
+        if lanelet.kind is not None
+    ]
     if not roads:
         raise InputError(
             f"{path}: {len(lanelets)} lanelets, none for vehicles", "use a scenario with a road"
@@ -118,7 +145,8 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
         stop_lines=tuple(stop_lines),
         signals=tuple(signals) or None,
     )
-    return lane_map, (*light_notes, *_lanelet_notes(root, lanelets))
+    notes = [*_lanelet_notes(root, lanelets, len(exchanged)), *_user_notes(lanelets)]
+    return lane_map, (*light_notes, *notes, *_sign_notes(root))
 
 
 def _lanelet(path: Path, element: Element, origin: F64) -> Lanelet:
@@ -140,9 +168,39 @@ def _lanelet(path: Path, element: Element, origin: F64) -> Lanelet:
         )
 
 
-def _with_bounds_in_order(lanelet: Lanelet) -> Lanelet:
-    """Return a lanelet whose left bound is on the left."""
-    if lanelet.has_exchanged_bounds:
+def _exchanged(lanelets: Sequence[Lanelet]) -> set[str]:
+    """Return the ids of the lanelets whose left bound the file names right and whose right one left.
+
+    The outline of a lanelet that is shorter than it is wide may be knotted. So one whose ends meet
+    those of a linked lanelet is taken as it is written where that one's bounds are in order.
+    """
+    by_outline = {
+        lanelet.lane_id for lanelet in lanelets if is_left_of(lanelet.right, lanelet.left)
+    }
+    in_order = {
+        lanelet.lane_id: lanelet for lanelet in lanelets if lanelet.lane_id not in by_outline
+    }
+    confirmed = set()
+    for lanelet in lanelets:
+        after = [in_order[name] for name in lanelet.linked("successor") if name in in_order]
+        before = [in_order[name] for name in lanelet.linked("predecessor") if name in in_order]
+        if any(_meet(lanelet, other) for other in after) or any(
+            _meet(other, lanelet) for other in before
+        ):
+            confirmed.add(lanelet.lane_id)
+    return by_outline - confirmed
+
+
+def _meet(lanelet: Lanelet, following: Lanelet) -> bool:
+    """Return whether both bounds of a lanelet end where those of the following one begin."""
+    left = lanelet.left[-1] - following.left[0]
+    right = lanelet.right[-1] - following.right[0]
+    return max(float(np.linalg.norm(gap[:2])) for gap in (left, right)) <= MEET_M
+
+
+def _with_bounds_in_order(lanelet: Lanelet, exchanged: Collection[str]) -> Lanelet:
+    """Return a lanelet whose left bound is on the left; ``exchanged`` holds the ids of the others."""
+    if lanelet.lane_id in exchanged:
         return replace(lanelet, left=lanelet.right, right=lanelet.left)
     return lanelet
 
@@ -165,8 +223,8 @@ def _lane(lanelet: Lanelet, signs: dict[str, float]) -> Lane:
         centre=centre_line(lanelet.left, lanelet.right),
         left=lanelet.left,
         right=lanelet.right,
-        kind=next((KINDS[name] for name in lanelet.types if name in KINDS), "vehicle"),
-        successors=tuple(str(link.get("ref")) for link in element.findall("successor")),
+        kind=str(lanelet.kind),
+        successors=tuple(lanelet.linked("successor")),
         left_neighbour=neighbours.get("adjacentLeft"),
         right_neighbour=neighbours.get("adjacentRight"),
         left_mark_type=_mark_type(element, "leftBound"),
@@ -222,12 +280,11 @@ def _signals(
     ]
 
 
-def _lanelet_notes(root: Element, lanelets: Sequence[Lanelet]) -> list[str]:
+def _lanelet_notes(root: Element, lanelets: Sequence[Lanelet], n_exchanged: int) -> list[str]:
     """Return notes on what was left out, assumed or put right."""
-    roads = [lanelet for lanelet in lanelets if lanelet.is_for_cars]
+    roads = [lanelet for lanelet in lanelets if lanelet.kind is not None]
     names = Counter(name for lanelet in lanelets for name in lanelet.types)
     road_names = Counter(name for lanelet in roads for name in lanelet.types)
-    n_exchanged = sum(lanelet.has_exchanged_bounds for lanelet in roads)
     notes = [
         f"{names[name]} lanelets of type {name} carry no vehicles and are no lanes"
         for name in sorted(names.keys() & NOT_FOR_CARS)
@@ -245,6 +302,26 @@ def _lanelet_notes(root: Element, lanelets: Sequence[Lanelet]) -> list[str]:
     notes.append(
         "road edges are the border of the union of the lanelets, seams up to 0.1 m closed; where the map ends, its border is an edge too"
     )
+    return notes
+
+
+def _user_notes(lanelets: Sequence[Lanelet]) -> list[str]:
+    """Return notes on lanelets that name their users."""
+    closed = sum(
+        bool(lanelet.users) and not lanelet.users & CARS and not NOT_FOR_CARS & {*lanelet.types}
+        for lanelet in lanelets
+    )
+    both_ways = sum(
+        any(user.text in CARS for user in lanelet.element.findall("userBidirectional"))
+        for lanelet in lanelets
+    )
+    notes = []
+    if closed:
+        notes.append(f"{closed} lanelets name users without cars: no lanes for cars")
+    if both_ways:
+        notes.append(
+            f"{both_ways} lanelets are for cars in both directions: driven in that of their bounds alone"
+        )
     return notes
 
 
@@ -315,10 +392,40 @@ def _speed_signs(root: Element) -> dict[str, float]:
     speeds: dict[str, float] = {}
     for sign in root.findall("trafficSign"):
         for part in sign.findall("trafficSignElement"):
-            if part.findtext("trafficSignID") in MAX_SPEED_SIGNS:
-                with contextlib.suppress(ValueError):  # "30 mph zone" is no number to rely on
-                    speeds[str(sign.get("id"))] = number(part, "additionalValue")
+            speed = _speed_of(part)
+            if speed is not None:
+                speeds[str(sign.get("id"))] = speed
     return speeds
+
+
+def _speed_of(part: Element) -> float | None:
+    """Return the speed in m/s that a part of a sign states; None where it states none."""
+    if part.findtext("trafficSignID") not in MAX_SPEED_SIGNS:
+        return None
+    stated = re.fullmatch(
+        r"([0-9.]+)\s*([a-z/]*)", (part.findtext("additionalValue") or "").strip()
+    )
+    if stated is None or stated[2] not in SPEED_UNITS_MPS:
+        return None
+    return float(stated[1]) * SPEED_UNITS_MPS[stated[2]]
+
+
+def _sign_notes(root: Element) -> list[str]:
+    """Return a note that names the signs which are not read, with how many there are."""
+    unread = Counter(
+        " ".join([str(part.findtext("trafficSignID")), *_values(part)])
+        for part in root.findall("trafficSign/trafficSignElement")
+        if _speed_of(part) is None
+    )
+    if not unread:
+        return []
+    listed = some_of([f"{name} ({count})" for name, count in sorted(unread.items())])
+    return [f"traffic signs that are not read: {listed}"]
+
+
+def _values(part: Element) -> list[str]:
+    values = [(value.text or "").strip() for value in part.findall("additionalValue")]
+    return [repr(value) for value in values if value]
 
 
 def _speed_limit(element: Element, signs: dict[str, float]) -> float | None:

@@ -25,6 +25,9 @@ from tests.scenarios.make_commonroad import (
 )
 
 
+NEW_TRAFFIC = obstacle(11, drive(20, 0), version="2020a")
+
+
 @pytest.fixture
 def log(tmp_path):
     return read_commonroad(write_commonroad(tmp_path / "a.xml"))
@@ -109,6 +112,25 @@ def test_shapes_become_boxes_round_them(tmp_path):
     )  # the polygon's middle, turned by 90 degrees
     assert_allclose(boxes["42"].track.xyz[0, :2], [80.0, 1.0], atol=1e-12)
     assert abs(yaw_from_quat(boxes["42"].track.quat[0])) == pytest.approx(np.pi)
+
+
+def test_a_wall_across_its_frame_is_a_turned_box_and_a_shape_with_a_hollow_is_said(tmp_path):
+    wall = f"<polygon>{points((0, 0), (30, 20), (29, 21.5), (-1, 1.5))}</polygon>"
+    angle = f"<polygon>{points((0, 0), (4, 0), (4, 1), (1, 1), (1, 4), (0, 4))}</polygon>"
+    still = obstacle(40, [state(0, 100.0, 30.0)], wall, "roadBoundary", static=True)
+    made = read(tmp_path, traffic=TRAFFIC + still)
+    (box,) = [one for one in made.actors if one.actor_id == "40"]
+    assert (box.box.length_m, box.box.width_m) == pytest.approx(
+        (np.hypot(30, 20), np.hypot(1, 1.5))
+    )
+    assert yaw_from_quat(box.track.quat[0]) == pytest.approx(np.arctan2(20, 30))
+    assert_allclose(box.track.xyz[0, :2], [80 + 14.5, 30 + 10.75])
+    assert "box around their shape" not in str(made.notes)
+    hollow = obstacle(41, [state(0, 100.0, 30.0)], angle, "building", static=True)
+    (note,) = [n for n in read(tmp_path, traffic=TRAFFIC + hollow).notes if "around their" in n]
+    assert note == (
+        "1 obstacles are taken as the box around their shape, which is up to 129% larger"
+    )
 
 
 SHIFTED = "<rectangle><length>4.4</length><width>1.8</width><originXShift>-1.35</originXShift></rectangle>"
@@ -218,6 +240,21 @@ def test_exchanged_bounds_are_put_right(tmp_path):
     log = read(tmp_path, lanes=swapped, traffic=obstacle(11, drive(20, 0)))
     assert log.lane_map.lanes["1"].left[0, 1] == 2.0
     assert "1 lanelets had left and right bound exchanged and were put right" in log.notes
+
+
+def test_a_lanelet_shorter_than_wide_keeps_the_sides_by_which_it_meets_the_next(tmp_path):
+    """The outline of its bounds, which run back, is that of exchanged ones."""
+    short = (
+        '<lanelet id="1">'
+        + bound("leftBound", (0.4, 2), (0.3, 2.1), (0, 2))
+        + bound("rightBound", (0.3, -2), (0.2, -2), (0, -2))
+        + '<successor ref="2"/></lanelet>'
+    )
+    log = read(tmp_path, lanes=short + lanelet(2, 0, 200, 0), traffic=obstacle(11, drive(20, 0)))
+    assert log.lane_map.lanes["1"].left[-1, 1] == 2.0
+    assert "exchanged" not in str(log.notes)
+    alone = read(tmp_path, lanes=short + lanelet(2, 9, 200, 0), traffic=obstacle(11, drive(20, 0)))
+    assert alone.lane_map.lanes["1"].left[-1, 1] == -2.0
 
 
 def test_crossing_lanelets_are_an_intersection_and_linked_ones_are_not(tmp_path):
@@ -414,6 +451,62 @@ def test_another_ego_can_be_asked_for(tmp_path):
     log = read(tmp_path, ego="12")
     assert [a.actor_id for a in log.actors] == ["11", "13"]
     assert log.notes[0] == "ego is the recorded vehicle 12, as asked"
+
+
+@pytest.mark.parametrize(
+    ("users", "kind"),
+    [
+        (("OneWay", "car", "bicycle"), "vehicle"),
+        (("OneWay", "vehicle"), "vehicle"),
+        (("OneWay", "bus", "taxi"), "vehicle"),
+        (("OneWay", "bus"), "bus"),
+        (("Bidirectional", "priorityVehicle"), "bus"),
+        (("OneWay", "bicycle"), "bike"),
+        (("Bidirectional", "pedestrian"), None),
+    ],
+)
+def test_a_lanelet_is_for_the_users_that_it_names(tmp_path, users, kind):
+    direction, *names = users
+    named = "".join(f"<user{direction}>{name}</user{direction}>" for name in names)
+    lanes = LANES + lanelet(7, 0, 200, 8, f"<laneletType>urban</laneletType>{named}")
+    made = read(tmp_path, lanes=lanes, version="2020a", traffic=NEW_TRAFFIC)
+    lane = made.lane_map.lanes.get("7")
+    assert (None if lane is None else lane.kind) == kind
+    note = "1 lanelets name users without cars: no lanes for cars"
+    assert (note in made.notes) == (kind != "vehicle")
+
+
+def test_a_lanelet_for_cars_in_both_directions_is_said(tmp_path):
+    named = "<userBidirectional>vehicle</userBidirectional>"
+    lanes = LANES + lanelet(7, 0, 200, 8, named)
+    made = read(tmp_path, lanes=lanes, version="2020a", traffic=NEW_TRAFFIC)
+    assert "1 lanelets are for cars in both directions" in str(made.notes)
+
+
+@pytest.mark.parametrize(
+    ("sign", "value", "limit_mps", "note"),
+    [
+        ("274", "13.9", 13.9, ""),
+        ("274", "50kmh", 50 / 3.6, ""),
+        ("R2-1", "25 mph", 25 * 0.44704, ""),
+        ("C43", "20.0", 20.0, ""),
+        ("274", "30 zone", None, "traffic signs that are not read: 274 '30 zone' (1)"),
+        ("274.1", "8.3", None, "traffic signs that are not read: 274.1 '8.3' (1)"),
+        ("206", None, None, "traffic signs that are not read: 206 (1)"),
+    ],
+)
+def test_limits_of_signs_are_applied_and_all_other_signs_are_named(
+    tmp_path, sign, value, limit_mps, note
+):
+    stated = "" if value is None else f"<additionalValue>{value}</additionalValue>"
+    element = (
+        f"<trafficSignElement><trafficSignID>{sign}</trafficSignID>{stated}</trafficSignElement>"
+    )
+    lanes = LANES + lanelet(7, 0, 200, 8, '<trafficSignRef ref="90"/>')
+    more = f'<trafficSign id="90">{element}</trafficSign>'
+    made = read(tmp_path, lanes=lanes, version="2020a", traffic=NEW_TRAFFIC, more=more)
+    assert made.lane_map.lanes["7"].speed_limit_mps == pytest.approx(limit_mps)
+    assert [n for n in made.notes if "traffic signs" in n] == ([note] if note else [])
 
 
 def test_fields_that_are_not_read_are_named(tmp_path):
