@@ -6,6 +6,7 @@ the first message that has any; a lane of the type intersection is an area, thro
 of lanes that it joins gets a lane.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -60,6 +61,7 @@ SOLID = 3
 DASHED = 4
 DOTS = 5
 YELLOW = 4
+OVERHANG_M = 0.2  # of a car beyond an axle, at least: its wheels have a radius
 ROAD_HEIGHT_M = 0.3  # wheels that are farther above or below the lanes are not on the road
 JOIN_STEPS = 16  # of a lane through an intersection
 DEFAULT = Vehicle()
@@ -115,10 +117,10 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
     chosen, why = _choose_ego(file, trace, ego)
     tracks = trace.tracks
     origin = np.array([*np.round(tracks[chosen].rows[0][1:3]), 0.0])
-    lanes = {} if trace.roads is None else _lanes(file, trace.roads, origin)
+    lanes, lane_notes = ({}, []) if trace.roads is None else _lanes(file, trace.roads, origin)
     has_lanes = any(lane.kind == "vehicle" for lane in lanes.values())
     vehicle, axle_notes = _vehicle(tracks[chosen])
-    notes = [f"ego is {why}: {chosen}", *trace.notes, *axle_notes]
+    notes = [f"ego is {why}: {chosen}", *trace.notes, *lane_notes, *axle_notes]
     if has_lanes:
         points = np.array(tracks[chosen].rows)[:, 1:4] - origin
         near(f"{file}, object {chosen}", points)
@@ -136,7 +138,9 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         lane_map = bordered(lanes, LaneMap({}))
         ground = ground_of(lane_map, ego_log.xyz)
     else:
-        notes.append("the trace holds no lanes: the driven path is one lane without lane markings")
+        notes.append(
+            "the trace holds no lanes to drive on: the driven path is one lane without lane markings"
+        )
         lane_map, ground = _driven_lane(ego_log)
     actors = [
         actor
@@ -175,6 +179,7 @@ class _Trace:
         n_messages: How many messages there are.
         host: Id of the host vehicle that the first message with one names.
         roads: The first message with lanes.
+        later_lanes: Ids of lanes that only later messages have.
         notes: What was left out.
     """
 
@@ -182,12 +187,14 @@ class _Trace:
     n_messages: int = 0
     host: str | None = None
     roads: Any = None
+    later_lanes: set[int] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
 
 
 def _read_trace(files: SourceFiles, path: Path) -> _Trace:
     """Collect the moving objects of all messages."""
     trace = _Trace()
+    first_lanes: set[int] = set()
     for truth in ground_truths(files, path):
         message = truth.message
         if not trace.n_messages:
@@ -199,6 +206,10 @@ def _read_trace(files: SourceFiles, path: Path) -> _Trace:
             trace.host = str(truth.host)
         if trace.roads is None and message.lane:
             trace.roads = message
+            first_lanes = {road_lane.id.value for road_lane in message.lane}
+        elif trace.roads is not None:
+            lanes = {road_lane.id.value for road_lane in message.lane}
+            trace.later_lanes |= lanes - first_lanes
         t_us = message.timestamp.seconds * 1_000_000 + round(message.timestamp.nanos / 1000)
         for moving_object in message.moving_object:
             place = moving_object.base.position
@@ -206,6 +217,10 @@ def _read_trace(files: SourceFiles, path: Path) -> _Trace:
             row = (t_us, place.x, place.y, place.z, turn.yaw, turn.pitch, turn.roll)
             key = moving_object.id.value
             trace.tracks.setdefault(key, _Track(moving_object)).rows.append(row)
+    if trace.later_lanes:
+        trace.notes.append(
+            f"lanes are those of the first message that has some: {len(trace.later_lanes)} lanes of later ones left out"
+        )
     return trace
 
 
@@ -269,7 +284,8 @@ def _vehicle(track: _Track) -> tuple[Vehicle, list[str]]:
     if attributes.HasField("bbcenter_to_front"):
         wheelbase_m = abs(attributes.bbcenter_to_front.x) + rear_m
     half_m = track.box.length_m / 2
-    if not (0 < rear_m <= half_m and 0 < wheelbase_m <= rear_m + half_m):
+    farthest_m = half_m - OVERHANG_M
+    if not (0 < rear_m <= farthest_m and 0 < wheelbase_m <= rear_m + farthest_m):
         notes.append(
             f"axles of the ego {rear_m:g} m behind its middle and {wheelbase_m:g} m apart do not fit a length of {track.box.length_m:g} m: they are placed in proportion"
         )
@@ -332,12 +348,14 @@ def _moved(lane: Lane, shift: F64) -> Lane:
     )
 
 
-def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
-    """Return the lanes of a message, linked."""
+def _lanes(path: Path, roads: Any, origin: F64) -> tuple[dict[str, Lane], list[str]]:
+    """Return the lanes of a message, linked, and notes on those that were left out."""
     borders = {border.id.value: border for border in roads.lane_boundary}
     lanes: dict[str, Lane] = {}
+    left_out: Counter[str] = Counter()
     for road_lane in roads.lane:
-        lane = _lane(f"{path}, lane {road_lane.id.value}", road_lane, borders, origin)
+        location = f"{path}, lane {road_lane.id.value}"
+        lane = _lane(location, road_lane, borders, origin, left_out)
         if lane is not None:
             lanes[lane.lane_id] = lane
     after = {key: list(lane.successors) for key, lane in lanes.items()}
@@ -372,14 +390,26 @@ def _lanes(path: Path, roads: Any, origin: F64) -> dict[str, Lane]:
             left_neighbour=same_way(lane, lanes, lane.left_neighbour),
             right_neighbour=same_way(lane, lanes, lane.right_neighbour),
         )
-    return out
+    return out, [f"lanes {why} left out: {n}" for why, n in sorted((+left_out).items())]
 
 
-def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64) -> Lane | None:
-    """Return a lane in driving direction; None for one that is not driven or lacks a border."""
+def _lane(
+    location: str,
+    road_lane: Any,
+    borders: Mapping[int, Any],
+    origin: F64,
+    left_out: Counter[str],
+) -> Lane | None:
+    """Return a lane in driving direction; None for one that is not driven, whose pieces link others,
+    or that lacks a line, which is counted in ``left_out`` by the reason.
+    """
     facts = road_lane.classification
     kind = "vehicle" if facts.type == DRIVING else KINDS.get(facts.subtype)
-    if kind is None or len(facts.centerline) < 2:
+    if kind is None:
+        left_out["that are not driven"] += facts.type != INTERSECTION
+        return None
+    if len(facts.centerline) < 2:
+        left_out["without a centre line"] += 1
         return None
     centre = near(location, _points(facts.centerline) - origin)
     sides = []
@@ -387,6 +417,7 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         lane_borders = [borders[ref.value] for ref in ids if ref.value in borders]
         edge = _edge(lane_borders, centre, origin)
         if edge is None:
+            left_out["without a boundary on both sides"] += 1
             return None
         sides.append((near(location, edge), _mark_type(lane_borders[0])))
     ahead, beside = _links(facts)
@@ -396,6 +427,7 @@ def _lane(location: str, road_lane: Any, borders: Mapping[int, Any], origin: F64
         sides = sides[::-1]
     (left, left_mark_type), (right, right_mark_type) = sides
     if arc_lengths(left)[-1] <= 0.0 or arc_lengths(right)[-1] <= 0.0:
+        left_out["without a length"] += 1
         return None
     return Lane(
         str(road_lane.id.value),

@@ -171,6 +171,7 @@ def axles(rear=None, front=None):
         (-1.2, 1.3, 1.2, False),
         (1.2, 1.3, 1.2, True),  # esmini's sign
         (-2.5, 1.3, None, True),
+        (-2.0, None, None, True),  # at the bumper
         (-1.2, 2.9, None, True),
         (0.0, 0.0, None, True),
         (None, None, None, False),
@@ -266,6 +267,33 @@ def test_esmini_s_traces_have_the_poses_and_roads_of_their_facts(shared_data):
     assert centre[[0, -1]] == pytest.approx([31.4, 153.503], abs=1e-3)
     other = cut_in.actors[0].track.xyz[[0, -1], :2] + cut_in.world_origin[:2]
     assert other == pytest.approx(np.array([[51.45, 1.535], [221.911, -1.535]]), abs=1e-3)
+
+
+def test_lanes_that_cannot_be_driven_are_counted_by_the_reason(tmp_path):
+    parts = messages()
+    for key in (3, 4, 5):
+        lane(parts[0], key, 4.5, True)
+    *_, without_line, without_border, sidewalk = (one.classification for one in parts[0].lane)
+    del without_line.centerline[:]
+    del without_border.left_lane_boundary_id[:]
+    sidewalk.type, sidewalk.subtype = 3, 0
+    made = load_scenario(written(tmp_path, parts))
+    assert list(made.lane_map.lanes) == ["1", "2"]
+    assert [note for note in made.notes if note.startswith("lanes ")] == [
+        "lanes that are not driven left out: 1",
+        "lanes without a boundary on both sides left out: 1",
+        "lanes without a centre line left out: 1",
+    ]
+
+
+def test_lanes_that_only_later_messages_have_are_said(tmp_path):
+    parts = messages()
+    lane(parts[5], 1, -1.5, True)
+    lane(parts[6], 8, 4.5, True)
+    made = load_scenario(written(tmp_path, parts))
+    assert list(made.lane_map.lanes) == ["1", "2"]
+    assert "1 lanes of later ones left out" in str(made.notes)
+    assert "of later ones" not in str(load_scenario(written(tmp_path, messages())).notes)
 
 
 def test_fields_that_are_not_read_are_named(tmp_path):
