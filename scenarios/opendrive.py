@@ -90,18 +90,27 @@ def following(odr: OdrMap, lanes: Mapping[str, Lane]) -> tuple[dict[str, Lane], 
         )
     out = dict(lanes)
     ends = []
+    opposed = []
     for road in odr.roads:
         for index, section in enumerate(road.sections):
             for lane in section.lanes:
                 key = lane_key(road, index, lane.lane_id)
                 if key not in out:
                     continue
-                ahead = _ahead(road, index, lane, roads, turns)
-                successors = tuple(dict.fromkeys(k for k in ahead if k in lanes))
-                out[key] = replace(out[key], successors=successors)
+                successors = []
+                for name, is_entered in _ahead(road, index, lane, roads, turns).items():
+                    if name in lanes and is_entered:
+                        successors.append(name)
+                    elif name in lanes:
+                        opposed.append(f"{key} to {name}")
+                out[key] = replace(out[key], successors=tuple(successors))
                 link = road.successor if driven_along(road, lane) else road.predecessor
                 if not successors and link is not None and out[key].kind == "vehicle":
                     ends.append(key)
+    if opposed:
+        notes.append(
+            f"{len(opposed)} links join lanes that are driven against each other, and are not followed: {some_of(opposed)}"
+        )
     if ends:
         notes.append(
             f"{len(ends)} lanes end although their road goes on, for want of a link: {some_of(ends)}"
@@ -148,27 +157,41 @@ def _turns(odr: OdrMap, roads: Mapping[str, Road]) -> tuple[Turns, int]:
 
 def _ahead(
     road: Road, index: int, lane: OdrLane, roads: Mapping[str, Road], turns: Turns
-) -> list[str]:
-    """Return the keys of the lanes that follow a lane of the section ``index`` of a road."""
+) -> dict[str, bool]:
+    """Return the keys of the lanes that are linked to the end of a lane of the section ``index`` of a
+    road, and whether they begin there: two shoulders around a corner may end at each other.
+    """
     along = driven_along(road, lane)
     linked = lane.successors if along else lane.predecessors
     next_section = index + (1 if along else -1)
     if 0 <= next_section < len(road.sections):
-        return [lane_key(road, next_section, i) for i in linked or (lane.lane_id,)]
+        return dict(_met(road, next_section, along, i) for i in linked or (lane.lane_id,))
     link = road.successor if along else road.predecessor
     if link is None:
-        return []
+        return {}
     if link.kind == "junction":
         connected = turns.get((link.target, road.road_id, lane.lane_id), [])
-        return [
-            lane_key(roads[target], _entered(roads[target], at_start), i)
+        return dict(
+            _met(roads[target], _entered(roads[target], at_start), at_start, i)
             for target, at_start, i in connected
-        ]
+        )
     target = roads.get(link.target)
     if target is None or not target.sections:
-        return []
+        return {}
     linked = linked or _linked_back(road, lane, target, link.at_start)
-    return [lane_key(target, _entered(target, link.at_start), i) for i in linked]
+    return dict(_met(target, _entered(target, link.at_start), link.at_start, i) for i in linked)
+
+
+def _met(road: Road, index: int, at_start: bool, lane_id: int) -> tuple[str, bool]:
+    """Return the key of a lane that is met at the start or the end of a section, and whether it is
+    driven on from there.
+    """
+    is_entered = any(
+        driven_along(road, lane) == at_start
+        for lane in road.sections[index].lanes
+        if lane.lane_id == lane_id
+    )
+    return lane_key(road, index, lane_id), is_entered
 
 
 def _entered(road: Road, at_start: bool) -> int:

@@ -179,6 +179,17 @@ def test_linked_lanes_that_do_not_meet_are_named():
     assert link_notes(pair(50.05)) == ()
 
 
+def test_links_between_lanes_that_end_at_each_other_are_said_and_not_followed():
+    """As shoulders around a corner: the number on the one side, its negative on the other."""
+    first = road("1", section(0, lane(1), lane(-1, None, 1)), after="road:2:start")
+    second = road("2", section(0, lane(1, -1), lane(-1)), x=50, before="road:1:end")
+    lane_map, notes = read(first, second)
+    assert [lane.successors for lane in lane_map.lanes.values()] == [(), (), (), ()]
+    assert "2 links join lanes that are driven against each other" in str(notes)
+    assert "1.0.-1 to 2.0.1" in str(notes)
+    assert link_notes(lane_map.lanes) == ()
+
+
 def test_ways_do_not_lead_over_gaps_and_the_run_names_them(tmp_path):
     first = road("1", section(0, lane(-1, None, -1)), after="road:2:start")
     second = road("2", section(0, lane(-1, -1)), x=53, before="road:1:end")

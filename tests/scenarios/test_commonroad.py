@@ -24,7 +24,6 @@ from tests.scenarios.make_commonroad import (
     write_commonroad,
 )
 
-
 NEW_TRAFFIC = obstacle(11, drive(20, 0), version="2020a")
 
 
