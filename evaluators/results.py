@@ -451,6 +451,21 @@ class Speed:
 
 
 @dataclass(frozen=True)
+class Slowing:
+    """How the time that a policy takes for a plan grows within a rollout, median over rollouts.
+
+    Attributes:
+        early_ms, late_ms: Milliseconds of a query, in the first and in the last quarter of a
+            rollout; its first query is left out.
+        n_rollouts: In which it grows.
+    """
+
+    early_ms: float
+    late_ms: float
+    n_rollouts: int
+
+
+@dataclass(frozen=True)
 class FixerFacts:
     """What a fixer did over the rollouts of its renderer.
 
@@ -505,6 +520,8 @@ class Summary:
         copies: Rollouts that were not driven, as their policy has no camera.
         fixers: VARIANT -> what its fixer did.
         speed: VARIANT -> time per frame.
+        slowing: POLICY -> how much longer its plans take at the end of a rollout; only of policies
+            whose plans do.
         pool: Throughput of the workers; None where nothing was driven.
         repeat: What ``--repeat`` found.
         exit_code: Of ``simrun score``.
@@ -525,6 +542,7 @@ class Summary:
     copies: int = 0
     fixers: dict[str, FixerFacts] = field(default_factory=dict)
     speed: dict[str, Speed] = field(default_factory=dict)
+    slowing: dict[str, Slowing] = field(default_factory=dict)
     pool: Pool | None = None
     repeat: Repeat | None = None
     exit_code: int | None = None

@@ -28,6 +28,7 @@ from evaluators.metrics import MetricTable
 from evaluators.results import (
     FailedRollout,
     Failures,
+    Slowing,
     Speed,
     StageSpeed,
     Summary,
@@ -95,6 +96,7 @@ def summary_of(info: RunInfo, manifests: Sequence[Manifest], rollouts: pa.Table)
         speed=by_policy(
             {policy: _speeds(policy_manifests) for policy, policy_manifests in finished.items()}
         ),
+        slowing=slowing_of(finished),
         pool=info.pool,
         repeat=info.repeat,
         exit_code=info.exit_code,
@@ -176,6 +178,37 @@ def speed(manifests: Sequence[Manifest]) -> Speed:
         first_frame_ms=round(float(np.median(first)), 3),
         stages={name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
     )
+
+
+LEAST_QUERIES = 20  # of a rollout, for its quarters to say something
+SLOWER = 2.0  # times as long in the last quarter
+SLOWER_MS = 10.0  # and longer by so much: less is the machine's noise
+MOST_ROLLOUTS = 0.75  # the share of rollouts in which it must be so
+
+
+def slowing_of(manifests_by_policy: Mapping[str, Sequence[Manifest]]) -> dict[str, Slowing]:
+    """Return how much longer the plans of a policy take at the end of its rollouts than at their
+    beginning, of each policy of which that is so in nearly all rollouts.
+    """
+    slowing: dict[str, Slowing] = {}
+    for policy, manifests in manifests_by_policy.items():
+        quarters = []
+        for manifest in manifests:
+            durations = manifest.stage_ms.get("policy", ())[1:]  # the first call may compile
+            if len(durations) >= LEAST_QUERIES:
+                size = len(durations) // 4
+                quarters.append((np.median(durations[:size]), np.median(durations[-size:])))
+        if not quarters:
+            continue
+        early_ms, late_ms = np.array(quarters).T
+        grows = (late_ms >= SLOWER * early_ms) & (late_ms >= early_ms + SLOWER_MS)
+        if np.mean(grows) >= MOST_ROLLOUTS:
+            slowing[policy] = Slowing(
+                early_ms=round(float(np.median(early_ms[grows])), 3),
+                late_ms=round(float(np.median(late_ms[grows])), 3),
+                n_rollouts=int(np.sum(grows)),
+            )
+    return slowing
 
 
 def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed:

@@ -199,10 +199,22 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
         [
             _rollout_case(rollout, with_values, outcomes_fail, accepts_failures)
             for rollout in run.rollouts
-        ],
+        ]
+        + check_cases(run),
         {key: value for key, value in facts.items() if value},
         run.info.started_at or "",
     )
+
+
+def check_cases(run: Run) -> list[Case]:
+    """Return a skipped case for each breach that the check of a policy found before the run: it
+    fails nothing, and CI services list it.
+    """
+    return [
+        Case(f"check.{policy}", name, {}, result="skipped", message=sentence)
+        for policy, check in run.info.policy_checks.items()
+        for name, sentence in check.breaches
+    ]
 
 
 def name_of(run: Run) -> str:

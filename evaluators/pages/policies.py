@@ -1,0 +1,32 @@
+"""What a reader must know of the policies of a run, whether a rollout failed or not."""
+
+from evaluators.statistics.numbers import plural, short
+from evaluators.statistics.opening import Run
+
+MOST_BREACHES = 3  # of one policy that are said on the first screen
+
+
+def policy_cautions(run: Run) -> list[str]:
+    """Say what the check before the run found in each policy, and whose plans take longer and
+    longer.
+    """
+    cautions = []
+    for policy, check in run.info.policy_checks.items():
+        sentences = [sentence for _, sentence in check.breaches]
+        cautions += [
+            f"The check of {policy} before the run: {sentence}"
+            for sentence in sentences[:MOST_BREACHES]
+        ]
+        n_left_out = len(sentences[MOST_BREACHES:])
+        if n_left_out:
+            cautions.append(
+                f"{plural(n_left_out, 'more breach', 'more breaches')} of {policy}: "
+                f"simrun check policy {policy} names all."
+            )
+    for policy, slowing in run.summary.slowing.items():
+        cautions.append(
+            f"{policy} takes longer and longer: {short(slowing.early_ms)} ms for a plan in the first "
+            f"quarter of a rollout, {short(slowing.late_ms)} ms in the last "
+            f"(in {plural(slowing.n_rollouts, 'rollout')})."
+        )
+    return cautions

@@ -1,0 +1,97 @@
+"""What a check of a policy found, and plans that take longer and longer, stand on every page of a run
+in which nothing failed.
+"""
+
+import html
+import json
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.runs.summary import slowing_of
+from tests.run_records import manifest
+
+POLICY = '''
+import time
+from dataclasses import replace
+
+from policies.simple import ConstantVelocity
+
+
+class Slow(ConstantVelocity):
+    """Takes longer with every plan."""
+
+    queries = 0
+
+    def act(self, observation):
+        self.queries += 1
+        time.sleep(0.001 * self.queries)
+        return super().act(observation)
+
+
+class Short(ConstantVelocity):
+    """Plans less than a second ahead."""
+
+    def act(self, observation):
+        plan = super().act(observation)
+        kept = plan.times_us < plan.t_us + 1_000_000
+        return replace(plan, times_us=plan.times_us[kept], xy=plan.xy[kept], yaw=plan.yaw[kept])
+'''
+
+
+def durations(values):
+    return manifest({"frames": 4, "stage_ms": {"policy": values}})
+
+
+def test_a_policy_is_slowing_where_nearly_all_rollouts_are():
+    steady, growing = [20.0] * 40, [float(5 + query) for query in range(40)]
+    noisy = [20.0, 60.0] * 20
+    assert slowing_of({"p": [durations(steady)] * 4}) == {}
+    assert slowing_of({"p": [durations(noisy)] * 4}) == {}
+    assert slowing_of({"p": [durations(growing)] * 2 + [durations(steady)] * 2}) == {}
+    assert slowing_of({"p": [durations(growing[:12])] * 4}) == {}
+    slowing = slowing_of({"p": [durations(growing)] * 3 + [durations(steady)]})["p"]
+    assert slowing.n_rollouts == 3
+    assert slowing.early_ms < 12
+    assert slowing.late_ms > 35
+    few_ms = [0.1 + 0.1 * query for query in range(40)]
+    assert slowing_of({"p": [durations(few_ms)] * 4}) == {}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Drive two policies of the user's own, neither of which fails."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "mine.py").write_text(POLICY)
+    scene = folder / "road.yaml"
+    scene.write_text(
+        "version: 1\nroad: {segments: [{kind: straight, length_m: 90}]}\n"
+        "ego: {speed_mps: 8}\ntiming: {duration_us: 4000000}\n"
+    )
+    words = ["--renderer", "clean", "--policy", f"{folder}/mine.py:Slow,{folder}/mine.py:Short"]
+    out = folder / "run"
+    assert run_command([*words, "--images", "none", "--quiet", "--out", str(out), str(scene)]) == 0
+    return out
+
+
+def test_what_the_check_found_is_on_every_page_though_nothing_failed(run):
+    (sentence,) = [
+        sentence
+        for name, check in json.loads((run / "run.json").read_text())["policy_checks"].items()
+        if name.endswith("Short")
+        for _, sentence in check["breaches"]
+    ]
+    words = sentence.split(":")[0]
+    assert words in html.unescape((run / "report.html").read_text())
+    assert words in (run / "summary.md").read_text()
+    cases = ET.parse(run / "junit.xml").getroot().iter("testcase")
+    (case,) = [case for case in cases if case.get("classname").startswith("check.")]
+    assert case.find("skipped").get("message") == sentence
+
+
+def test_plans_that_take_longer_and_longer_are_noticed(run):
+    assert "takes longer and longer" in (run / "report.html").read_text()
+    slowing = json.loads((run / "summary.json").read_text())["slowing"]
+    assert [name for name in slowing if not name.endswith("Slow")] == []
+    assert len(slowing) == 1
