@@ -215,7 +215,10 @@ class Difference:
         test: Name of the test.
         difference: What is shown on these scenes, whatever the margin; None: nothing.
         verdict: About other scenes, against the margin.
-        more_scenes: The fewest more that would decide an undecided verdict.
+        more_scenes: The fewest more that would decide an undecided verdict, with 80 % probability if
+            what these scenes show is true: as "worse" where the mean is beyond the margin, else as
+            "non-inferior".
+        more_scenes_to_differ: The same of ``difference``, where there is none yet.
         scenes: How many went which way.
         cells: The same of the cells of a flag.
         beyond: What lies beyond the cap of a claim.
@@ -244,6 +247,7 @@ class Difference:
     difference: Contrast | None = None
     verdict: Verdict = "undecided"
     more_scenes: int | None = None
+    more_scenes_to_differ: int | None = None
     scenes: SceneCounts | None = None
     cells: CellCounts | None = None
     beyond: Beyond | None = None

@@ -22,7 +22,7 @@ from evaluators.statistics.decision import stopping_note
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run, read_run
 from evaluators.statistics.paired import BLOCKS
-from evaluators.statistics.sentences import claim_text
+from evaluators.statistics.sentences import claim_text, is_beyond_margin
 
 EPILOG = """
 Examples:
@@ -169,7 +169,8 @@ def _table(
         entry = entries[row.metric]
         verdict: str = entry.verdict
         if entry.more_scenes:
-            verdict += f", at least {entry.more_scenes} more scenes"
+            answer = "worse" if is_beyond_margin(entry) else "non-inferior"
+            verdict += f", at least {entry.more_scenes} more scenes for {answer}"
         scale = 100.0 if metric_table.shown(row.metric).in_percent else 1.0
         margin = f"{scale * entry.margin:g}"
         pairs = f"{entry.n_cells} in {plural(entry.n_scenes, 'scene')}"

@@ -26,7 +26,7 @@ from evaluators.statistics.numbers import (
     short,
 )
 from evaluators.statistics.opening import Run
-from evaluators.statistics.sentences import MANY_SCENES
+from evaluators.statistics.sentences import are_shipped, fewest_scenes, open_text, shipped_text
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral"]
 
@@ -57,7 +57,8 @@ class PrimaryDifference:
     Attributes:
         bounds: 95 % interval over scenes; None with one scene.
         verdict: What a sentence about the variant says, unless it is undecided.
-        more_scenes: How many more would decide; None where it is decided, or not known.
+        needed: How many scenes would answer what is open; empty where it is decided, or not known.
+        fewest: The number of the question that takes the fewest; None where none is known.
     """
 
     baseline: str
@@ -68,7 +69,8 @@ class PrimaryDifference:
     verdict: str
     text: str
     n_scenes: int
-    more_scenes: int | None
+    needed: str
+    fewest: int | None
 
     @property
     def band(self) -> tuple[float, float]:
@@ -299,7 +301,7 @@ def overview_of(run: Run) -> Overview:
         primary.direction == "higher",
         boundary["sentence"]
         if boundary
-        else decided(rows)
+        else f"{decided(rows)}{_with_shipped_scenes(run, rows)}"
         if decision is None
         else verdict_text(decision),
         tuple(cautions),
@@ -342,12 +344,13 @@ def differences_of(run: Run) -> dict[str, PrimaryDifference]:
             entry = pairs.get(metric.name)
             if key not in differences and entry is not None and entry.diff is not None:
                 baseline = variant_name(run, entry.baseline)
-                differences[key] = _primary_difference(metric, entry, entry.diff, baseline)
+                name = variant_name(run, key)
+                differences[key] = _primary_difference(metric, entry, entry.diff, name, baseline)
     return differences
 
 
 def _primary_difference(
-    metric: MetricInfo, entry: Difference, diff: float, baseline: str
+    metric: MetricInfo, entry: Difference, diff: float, name: str, baseline: str
 ) -> PrimaryDifference:
     scale, _ = scale_and_unit(metric, metric.unit)
     tone = tone_of(entry)
@@ -365,7 +368,8 @@ def _primary_difference(
         verdict,
         f"{texts[0]} ({' to '.join(texts[1:])})" if bounds else texts[0],
         entry.n_scenes,
-        entry.more_scenes if tone == "unclear" else None,
+        open_text(name, baseline, entry, metric) if tone == "unclear" else "",
+        fewest_scenes(entry) if tone == "unclear" else None,
     )
 
 
@@ -384,20 +388,26 @@ def decided(rows: Sequence[VariantRow]) -> str:
         name: difference for name, difference in differences.items() if difference.tone == "unclear"
     }
     if still_open:
-        text = f"Not decided with {plural(min(difference.n_scenes for difference in still_open.values()), 'scene')}"
-        if parts:
-            text += f": {', '.join(still_open)}"
-        needed = [
-            difference.n_scenes + difference.more_scenes
-            for difference in still_open.values()
-            if difference.more_scenes is not None
-        ]
-        if needed:
-            most = max(needed)
-            text += f"; {'more than' if most > MANY_SCENES else 'at least'} "
-            text += f"{min(most, MANY_SCENES)} scenes are needed"
-        parts.append(text)
+        fewest = min(difference.n_scenes for difference in still_open.values())
+        text = f"Not decided with {plural(fewest, 'scene')}"
+        needed = [difference.needed or name for name, difference in still_open.items()]
+        parts.append(f"{text}: {'; '.join(needed)}")
     return ". ".join(parts)
+
+
+def _with_shipped_scenes(run: Run, rows: Sequence[VariantRow]) -> str:
+    """Name the command that drives the shipped scenes, where they are enough for a question that is
+    open; empty where they are not, or where the run is not about them.
+    """
+    is_shipped = all(name.startswith("suites/") for name in run.info.asked or ("",))
+    open_rows = [row for row in rows if row.difference is not None and row.difference.fewest]
+    enough = [row for row in open_rows if are_shipped(row.difference.fewest)]
+    if not is_shipped or not enough or len(run.policies) > 1:
+        return ""
+    names = dict.fromkeys(
+        name for row in enough if row.difference for name in (row.difference.baseline, row.key)
+    )
+    return f"; {shipped_text(list(names), run.policies)}"
 
 
 def _row(

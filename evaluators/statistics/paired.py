@@ -59,7 +59,9 @@ from evaluators.statistics.verdicts import (
     corrected,
     difference,
     harm,
-    more_scenes,
+    more_than,
+    scenes_to_decide,
+    scenes_to_differ,
     scenes_without_event,
     sign_flip,
     sign_test,
@@ -210,10 +212,22 @@ def decided_together(
         for name, entry in entries.items()
     }
     p_corrected = corrected(p_values, metric_table.primary)
+    n_tests = {
+        is_primary: sum(
+            p_value is not None and (name == metric_table.primary) == is_primary
+            for (_, _, name), p_value in p_values.items()
+        )
+        for is_primary in (True, False)
+    }
     return {
         block: {
             variant: {
-                name: decide(entry, metric_table.info(name), p_corrected[block, variant, name])
+                name: decide(
+                    entry,
+                    metric_table.info(name),
+                    p_corrected[block, variant, name],
+                    n_tests[name == metric_table.primary],
+                )
                 for name, entry in entries.items()
             }
             for variant, entries in table.items()
@@ -309,13 +323,16 @@ def measure(
     return entry
 
 
-def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> Difference:
+def decide(
+    entry: Difference, metric: MetricInfo, p_corrected: float | None, n_tests: int = 1
+) -> Difference:
     """Decide about a difference: what is shown on its scenes, and the verdict about others.
 
     Args:
         entry: What `measure` gave.
         metric: What was compared.
         p_corrected: Its p-value, corrected for what else is tested; None where there is no test.
+        n_tests: How many differences are tested together.
     """
     if entry.diff is None or p_corrected is None:
         return entry
@@ -324,6 +341,9 @@ def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> 
         p_corrected=p_corrected,
         difference=difference(entry.diff, p_corrected, metric.direction),
     )
+    if entry.difference is None and entry.spread is not None and metric.direction != "none":
+        needed = scenes_to_differ(entry.diff, entry.spread, n_tests)
+        entry = replace(entry, more_scenes_to_differ=more_than(needed, entry.n_scenes))
     if entry.ci95 is None:
         return entry
     answer, reasons = _verdict_about_others(entry, metric, p_corrected)
@@ -331,7 +351,7 @@ def decide(entry: Difference, metric: MetricInfo, p_corrected: float | None) -> 
     entry = replace(entry, verdict=answer, note="; ".join(notes) or None)
     if answer != "undecided" or (metric.direction == "none" and entry.margin == 0.0):
         return entry
-    return replace(entry, more_scenes=_more_scenes(entry, metric))
+    return replace(entry, more_scenes=_more_scenes(entry, metric, n_tests))
 
 
 def _verdict_about_others(
@@ -365,7 +385,7 @@ def _unguarded_bounds(entry: Difference, metric: MetricInfo) -> Bounds | None:
     return entry.cut_mean - half, entry.cut_mean + half
 
 
-def _more_scenes(entry: Difference, metric: MetricInfo) -> int | None:
+def _more_scenes(entry: Difference, metric: MetricInfo, n_tests: int) -> int | None:
     """Return how many more scenes would decide an undecided difference; None where none would."""
     if entry.cut_mean is None or entry.spread is None:
         return None
@@ -373,7 +393,8 @@ def _more_scenes(entry: Difference, metric: MetricInfo) -> int | None:
     if metric.direction != "none":
         worse, _ = harm((entry.cut_mean, entry.cut_mean), metric.direction)
     reach = reach_of(metric, entry.margin)
-    return more_scenes(worse, entry.spread, entry.n_scenes, entry.margin, reach)
+    needed = scenes_to_decide(worse, entry.spread, entry.margin, reach, n_tests)
+    return more_than(needed, entry.n_scenes)
 
 
 def _scene_means(pairs: Pairs, delta: F64) -> F64:

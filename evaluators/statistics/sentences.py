@@ -2,6 +2,9 @@
 report and the terminal.
 """
 
+import shlex
+from collections.abc import Sequence
+
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
 from evaluators.results import Difference, to_json
@@ -15,6 +18,8 @@ from evaluators.statistics.numbers import (
 
 MANY_SCENES = 1000  # an estimate beyond this says no more than "many"
 NAMED = 3  # scenes and cells in a sentence
+SHIPPED = "suites/all"
+SHIPPED_SCENES = 42  # of that suite
 
 
 def difference_text(entry: Difference, metric: MetricInfo) -> str:
@@ -41,9 +46,9 @@ def difference_text(entry: Difference, metric: MetricInfo) -> str:
     claim = claim_text(entry, metric)
     if claim:
         text += f"; {claim}"
-    needed = more_scenes_text(entry.more_scenes)
+    needed = more_scenes_text(entry)
     if needed:
-        text += f"; {needed} on the margin of {short(entry.margin * scale, unit)}"
+        text += f"; {needed} the margin of {short(entry.margin * scale, unit)}"
     return text
 
 
@@ -74,13 +79,96 @@ def beyond_text(beyond: JsonView) -> str:
     return f"{beyond['n']} of {scenes} {beyond['event']}, of others at most {at_most}"
 
 
-def more_scenes_text(more: int | None) -> str:
-    """Say how many more scenes an undecided verdict needs; empty where that is unknown."""
-    if more is None:
+def is_beyond_margin(entry: Difference) -> bool:
+    """Tell which answer an undecided verdict is nearer to: "worse" where the mean of these scenes is
+    beyond the margin, else "non-inferior".
+    """
+    if entry.cut_mean is None:
+        return False
+    worse = {"lower": entry.cut_mean, "higher": -entry.cut_mean, "none": abs(entry.cut_mean)}
+    return worse[entry.direction] > entry.margin
+
+
+def more_scenes_text(entry: Difference) -> str:
+    """Say how many more scenes an undecided verdict needs, and for which answer; empty where that is
+    unknown.
+    """
+    if entry.more_scenes is None:
         return ""
-    if more > MANY_SCENES:
-        return f"more than {MANY_SCENES} more scenes would decide"
-    return f"at least {plural(more, 'more scene')} would decide"
+    answer = "beyond" if is_beyond_margin(entry) else "within"
+    number = f"at least {plural(entry.more_scenes, 'more scene')}"
+    if entry.more_scenes > MANY_SCENES:
+        number = f"more than {MANY_SCENES} more scenes"
+    return f"{number} would show that it is {answer}"
+
+
+def open_text(name: str, baseline: str, entry: Difference, metric: MetricInfo) -> str:
+    """Say how many scenes would answer what is open about a variant, each question by itself; empty
+    where no number is known.
+
+    Args:
+        name: Of the variant.
+        baseline: What it is compared with.
+        entry: Its undecided difference.
+        metric: What was compared.
+    """
+    scale, unit = scale_and_unit(metric, metric.unit)
+    margin = f"{entry.margin * scale:g} {unit}".rstrip()
+    is_beyond = is_beyond_margin(entry)
+    is_worse = (
+        is_beyond or (entry.diff or 0.0) * (-1.0 if entry.direction == "higher" else 1.0) > 0.0
+    )
+    parts: list[str] = []
+    to_differ = entry.more_scenes_to_differ
+    if to_differ is not None and not (is_beyond and to_differ == entry.more_scenes):
+        side = "worse" if is_worse else "better"
+        parts.append(
+            f"{_scenes_in_all(entry, to_differ)} would show that {name} is {side} than {baseline}"
+        )
+    if entry.more_scenes is not None:
+        number = _scenes_in_all(entry, entry.more_scenes)
+        who = "it" if parts else name
+        if not is_beyond:
+            claim = f"{who} is within {margin} of {baseline}"
+        elif parts:
+            claim = f"{who} is by more than {margin}"
+        else:
+            claim = f"{who} is worse than {baseline} by more than {margin}"
+        parts.append(f"{number} {'' if parts else 'would show '}that {claim}")
+    return " and ".join(parts)
+
+
+def fewest_scenes(entry: Difference) -> int | None:
+    """Return how many scenes in all answer one of the open questions about a variant; None where no
+    number is known.
+    """
+    numbers = [n for n in (entry.more_scenes, entry.more_scenes_to_differ) if n is not None]
+    return entry.n_scenes + min(numbers) if numbers else None
+
+
+def are_shipped(n_scenes: int) -> bool:
+    """Tell whether so many scenes ship."""
+    return n_scenes <= SHIPPED_SCENES
+
+
+def shipped_text(renderers: Sequence[str], policies: Sequence[str]) -> str:
+    """Name the command that drives all scenes that ship.
+
+    Args:
+        renderers, policies: That are driven.
+
+    Example:
+        >>> shipped_text(["clean", "3dgs"], ["lane-camera"])
+        'simrun --renderer clean,3dgs --policy lane-camera suites/all drives 42'
+    """
+    options = ["--renderer", ",".join(renderers), "--policy", ",".join(policies)]
+    return f"simrun {shlex.join(options)} {SHIPPED} drives {SHIPPED_SCENES}"
+
+
+def _scenes_in_all(entry: Difference, more: int) -> str:
+    """Print a number of scenes, those of the run included."""
+    needed = entry.n_scenes + more
+    return f"more than {MANY_SCENES}" if needed > MANY_SCENES else f"about {needed}"
 
 
 def change_text(entry: JsonView, metric: MetricInfo) -> str:

@@ -242,13 +242,14 @@ POWER = 0.8
 MOST_SCENES = 100_000  # beyond, this suite cannot decide it
 
 
-def scenes_needed(distance: float, spread: float) -> float:
-    """Return the number of scenes at which a 95 % interval leaves out the margin with probability
+def scenes_needed(distance: float, spread: float, n_tests: int = 1) -> float:
+    """Return the number of scenes at which a 95 % interval leaves out a value with probability
     `POWER`: the sample size of a one-sample test.
 
     Args:
-        distance: Of the true difference from the margin, in the metric's unit.
+        distance: Of the true difference from that value, in the metric's unit.
         spread: Standard deviation of the difference between scenes (seeds averaged), same unit.
+        n_tests: Tests that share the error.
 
     Example:
         >>> round(scenes_needed(distance=0.5, spread=1.0), 1)
@@ -256,7 +257,20 @@ def scenes_needed(distance: float, spread: float) -> float:
     """
     if distance == 0.0:
         return math.inf
-    return float((np.sum(scipy.special.ndtri([1 - TAIL, POWER])) * spread / distance) ** 2)
+    quantiles = scipy.special.ndtri([1 - TAIL / n_tests, POWER])
+    return float((np.sum(quantiles) * spread / distance) ** 2)
+
+
+def scenes_to_differ(diff: float, spread: float, n_tests: int) -> float:
+    """Return the number of scenes at which the test of no difference rejects with probability
+    `POWER`, after the correction for ``n_tests`` of them; infinite without a difference.
+
+    Example:
+        >>> scenes_to_differ(1.0, 0.0, 1)  # all to one side: 2 / 2^6 < 5 %
+        6.0
+    """
+    fewest = math.ceil(math.log2(2.0 * n_tests / ALPHA))
+    return max(scenes_needed(diff, spread, n_tests), float(fewest))
 
 
 def scenes_without_event(margin: float, reach: float = 1.0) -> float:
@@ -276,25 +290,28 @@ def scenes_without_event(margin: float, reach: float = 1.0) -> float:
     return 2 if margin >= reach else max(2, math.ceil(math.log(TAIL) / math.log1p(-margin / reach)))
 
 
-def more_scenes(
-    harm: float, spread: float, n_scenes: int, margin: float, reach: float
-) -> int | None:
-    """Return how many more scenes would decide an undecided verdict at the least: with 80 %
-    probability if what was seen is true, and no other scene is far worse.
+def scenes_to_decide(
+    harm: float, spread: float, margin: float, reach: float, n_tests: int
+) -> float:
+    """Return how many scenes would decide about a margin at the least: with 80 % probability if what
+    was seen is true, and no other scene is far worse.
 
     Args:
         harm: The mean difference that the claim is about, positive is worse.
         spread: Standard deviation of the difference between scenes.
-        n_scenes: Scenes so far.
         margin: As for the verdict.
         reach: The most that counts of a scene.
-
-    Returns:
-        At least 1; None where the difference lies on the margin or more than `MOST_SCENES` would be
-        needed.
+        n_tests: Differences that are tested together; a verdict of "worse" needs the test as well.
     """
     needed = max(scenes_needed(abs(harm - margin), spread), LEAST_SCENES)
     # as many as show that nothing was missed
     worst = reach - harm if harm < margin else reach + harm
     needed = max(needed, scenes_without_event(abs(margin - harm), worst))
+    if harm > margin:
+        needed = max(needed, scenes_to_differ(harm, spread, n_tests))
+    return needed
+
+
+def more_than(needed: float, n_scenes: int) -> int | None:
+    """Return how many scenes are missing, at least 1; None where more than `MOST_SCENES` are needed."""
     return None if needed > MOST_SCENES else max(1, math.ceil(needed) - n_scenes)

@@ -81,6 +81,23 @@ def test_an_undecided_difference_says_how_many_more_scenes_would_decide_it():
     )  # as many as show that nothing was missed
 
 
+def test_the_scenes_that_show_a_difference_are_counted_for_so_many_tests_as_are_read_together():
+    """One of three scenes has the event: 24 scenes reject by themselves, 29 with Holm for two."""
+
+    def variant(name, values):
+        return rows_of([[value] for value in values], METRICS.primary, name)
+
+    base = variant("clean", (0.0, 0.0, 0.0))
+    worse = variant("3dgs", (1.0, 0.0, 0.0))
+    alone = paired([*base, *worse], "clean")["3dgs"][METRICS.primary]
+    assert (alone.more_scenes, alone.more_scenes_to_differ) == (27 - 3, 24 - 3)
+    both = paired([*base, *worse, *variant("onefixer", (0.0, 0.0, 0.0))], "clean")
+    entry = both["3dgs"][METRICS.primary]
+    assert (entry.more_scenes, entry.more_scenes_to_differ) == (29 - 3, 29 - 3)
+    alike = both["onefixer"][METRICS.primary]
+    assert (alike.more_scenes, alike.more_scenes_to_differ) == (183 - 3, None)
+
+
 def test_rare_events_alone_never_decide_on_few_scenes():
     found = pair([[0.0, 0.0]] * 20, [[0.0, 0.0]] * 20, "offroad")
     bound = 1 - 0.025 ** (1 / 20)

@@ -107,8 +107,9 @@ def test_a_terminal_narrower_than_the_plot_shows_every_difference(three, width):
 def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal(
     three,
 ):
-    few = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26)
-    run = with_pairs(three, **{"3dgs": few, "onefixer": dataclasses.replace(few, more_scenes=180)})
+    few = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26, cut_mean=0.25, p_value=1.0)
+    none = pair(0.0, -0.5, 0.5, "undecided", more_scenes=180, cut_mean=0.0, p_value=1.0)
+    run = with_pairs(three, **{"3dgs": few, "onefixer": none})
     shown = overview_of(run)
     assert [row.difference and row.difference.tone for row in shown.rows] == [
         None,
@@ -116,8 +117,38 @@ def test_an_undecided_difference_names_the_scenes_once_and_is_never_called_equal
         "unclear",
     ]
     assert shown.decision.replace("\u00a0", " ").count("with 3 scenes") == 1
-    assert "183" in shown.decision
-    assert "29" not in shown.decision
+    assert shown.decision.replace("\u00a0", " ") == (
+        "Not decided with 3 scenes: about 29 would show that 3dgs is worse than clean by more than "
+        "2 points; about 183 would show that onefixer is within 2 points of clean"
+    )
+
+
+def test_two_questions_about_one_variant_have_a_number_each(three):
+    entry = pair(0.25, -0.1, 0.6, "undecided", more_scenes=24, cut_mean=0.25, p_value=1.0)
+    entry = dataclasses.replace(entry, more_scenes_to_differ=21)
+    assert overview_of(with_pairs(three, **{"3dgs": entry})).decision.endswith(
+        "about 24 would show that 3dgs is worse than clean and about 27 that it is by more than 2 points"
+    )
+    better = pair(-0.1, -0.6, 0.1, "undecided", more_scenes=57, cut_mean=-0.1, p_value=1.0)
+    better = dataclasses.replace(better, more_scenes_to_differ=274)
+    assert overview_of(with_pairs(three, **{"3dgs": better})).decision.endswith(
+        "about 277 would show that 3dgs is better than clean and about 60 that it is within 2 points "
+        "of clean"
+    )
+
+
+def test_the_shipped_scenes_are_named_where_they_are_enough_for_an_open_question(three):
+    few = pair(0.25, -0.1, 0.6, "undecided", more_scenes=26, cut_mean=0.25, p_value=1.0)
+    none = pair(0.0, -0.5, 0.5, "undecided", more_scenes=180, cut_mean=0.0, p_value=1.0)
+    run = with_pairs(three, **{"3dgs": few, "onefixer": none})
+    command = "simrun --renderer clean,3dgs --policy lane-camera suites/all drives 42"
+    for asked, is_named in ((("suites/first",), True), (("mine.yaml",), False), (None, False)):
+        info = dataclasses.replace(run.info, asked=asked)
+        decision = overview_of(dataclasses.replace(run, info=info)).decision
+        assert (command in decision) == is_named
+    only_none = with_pairs(three, **{"onefixer": none})
+    info = dataclasses.replace(run.info, asked=("suites/first",))
+    assert "simrun" not in overview_of(dataclasses.replace(only_none, info=info)).decision
 
 
 def test_what_is_decided_is_named_beside_what_is_not(three):
