@@ -5,6 +5,10 @@ frame (x forward, y left), in metres, radians and microseconds; they reach two s
 turn with a mirrored scene, and with a mirrored image or route alone; they begin with the ego's
 speed; the same seed gives the same plans; a reset forgets the rollout before; an older frame is
 accepted; the plan is in time. Notes say which inputs the plan follows, and how late.
+
+Situations begin when the scenario begins that the policy was made for. They have its cameras, not
+its road and its traffic: what a policy looks up of them would contradict what it is shown, so such a
+policy is driven along the recording alone, and nothing is said of where it leads.
 """
 
 from __future__ import annotations
@@ -13,12 +17,22 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from alpasim_plugin.core.errors import PolicyError, SimrunError, is_interruption
-from alpasim_plugin.core.geometry import inverse, se2, trajectory_from_poses, transform_points
+from alpasim_plugin.core.geometry import (
+    arc_lengths,
+    interpolate,
+    inverse,
+    project,
+    resample,
+    se2,
+    trajectory_from_poses,
+    transform_points,
+)
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts.blame import defined, noted, raised, runs_users_code
 from alpasim_plugin.core.plan_check import (
@@ -28,6 +42,7 @@ from alpasim_plugin.core.plan_check import (
     shape_problem,
     unit_guess,
 )
+from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.core.types import (
     F64,
     CameraSpec,
@@ -59,9 +74,9 @@ MOST_SHARE = 1.6
 MOST_MPS = 25.0
 
 
-def time_fault(plan: Plan, now: int) -> str:
-    """Check that times are integer microseconds, begin at the observation, increase, and reach far
-    enough in fine enough steps.
+def time_fault(plan: Plan, now: int, least_s: float = MIN_HORIZON_S) -> str:
+    """Check that times are integer microseconds, begin at the observation, increase, and reach
+    ``least_s`` ahead in fine enough steps.
     """
     problem = plan_problem(plan, now)
     if problem:
@@ -70,8 +85,8 @@ def time_fault(plan: Plan, now: int) -> str:
     steps = np.diff(times)
     horizon_s = int(times[-1] - times[0]) * 1e-6
     widest_s = int(steps.max()) * 1e-6
-    if horizon_s < MIN_HORIZON_S:
-        return f"the plan ends {horizon_s:.3f} s ahead; the controller needs {MIN_HORIZON_S:.0f} s"
+    if horizon_s < least_s:
+        return f"the plan ends {horizon_s:.3f} s ahead; the controller needs {least_s:.3g} s"
     if widest_s > MAX_STEP_S:
         return f"poses of the plan are up to {widest_s:.2f} s apart; {MAX_STEP_S} s is the most"
     return ""
@@ -205,18 +220,18 @@ def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[Check]:
     return out
 
 
-# Of every plan, given the plan and the time of its observation; a later check needs what the earlier
-# ones assure.
-PLAN_FAULTS: tuple[tuple[str, Callable[[Plan, int], str], str], ...] = (
+# Of every plan, given the plan, the time of its observation and how far it must reach in seconds; a
+# later check needs what the earlier ones assure.
+PLAN_FAULTS: tuple[tuple[str, Callable[[Plan, int, float], str], str], ...] = (
     (
         "values",
-        lambda plan, now: shape_problem(plan, min_rows=2),
+        lambda plan, now, least_s: shape_problem(plan, min_rows=2),
         "shapes fit and every value is finite",
     ),
     ("times", time_fault, f"times begin now, increase, and reach {MIN_HORIZON_S:.0f} s"),
     (
         "frame",
-        lambda plan, now: frame_fault(plan),
+        lambda plan, now, least_s: frame_fault(plan),
         "plans begin at the ego and yaw follows the motion",
     ),
 )
@@ -273,7 +288,8 @@ CHANGE = 3  # the step from which the scene of a probe differs
 class Situation:
     """A stretch of road driven at a constant speed, with a policy query every 0.1 s; a blank one
     shows the policy a grey image; without a route, all its points are NaN. From step `CHANGE` on, the image and the route may bend
-    otherwise than the road.
+    otherwise than the road. A recorded one is the recorded drive of the scenario, from ``first_step``
+    on as far as it lasts.
     """
 
     name: str
@@ -285,6 +301,8 @@ class Situation:
     has_route: bool = True
     image_1pm: float | None = None
     route_1pm: float | None = None
+    is_recorded: bool = False
+    first_step: int = 0
 
 
 BEND = 1 / 60
@@ -301,6 +319,9 @@ ROUTE_LEFT = Situation("the route alone bends left", steps=STEPS, route_1pm=BEND
 NO_ROUTE = Situation("no route", steps=STEPS, has_route=False)
 IMAGE_LEFT = replace(NO_ROUTE, name="no route, the image bends left", image_1pm=BEND)
 IMAGES = (NO_ROUTE, IMAGE_LEFT)
+RECORDED = Situation("the recorded drive", steps=STEPS, is_recorded=True)
+RECORDED_LATER = replace(RECORDED, name="the recorded drive, one second later", first_step=10)
+RECORDED_OLD_FRAME = replace(RECORDED, name="old frame", frame_age_us=STEP_US)
 CAMERAS = (
     pinhole_camera(),
     pinhole_camera("left", mount_m=(1.6, 0.5, 1.5), yaw_deg=60.0),
@@ -318,57 +339,188 @@ def canned_scenario(cameras: Sequence[CameraSpec] = CAMERAS) -> Scenario:
     return replace(blank_scenario("conformance", log, cameras), start_us=START_US)
 
 
-def check_policy(policy: Policy | str, scenario: Scenario | None = None) -> Report:
-    """Drive a policy through the canned situations and report every breach of the contract.
+@dataclass(frozen=True)
+class WatchedScenario(Scenario):
+    """A scenario that notes which of its members are read that the situations do not have.
 
-    A policy with ``controller = "perfect"`` replays a recording, so it is only queried where
-    `canned_scenario` has a recording.
+    Attributes:
+        looked_up: Their names.
+    """
+
+    looked_up: set[str] = field(default_factory=set)
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> WatchedScenario:
+        """Return a scenario that is watched."""
+        watched = object.__new__(cls)
+        vars(watched).update(vars(scenario), looked_up=set())
+        return watched
+
+    def __getattribute__(self, name: str) -> Any:
+        is_copied = name == "__getstate__"  # by a copy of all, as for another process
+        if is_copied or not (name in SAME_IN_SITUATIONS or name.startswith("__")):
+            vars(self)["looked_up"].add("all" if is_copied else name)
+        return super().__getattribute__(name)
+
+
+# What the situations have in common with the scenario that they are driven in.
+SAME_IN_SITUATIONS = {
+    "looked_up",
+    "period_us",
+    "scene_id",
+    "source",
+    "source_part",
+    "seed",
+    "vehicle",
+    "cameras",
+    "rates",
+    "start_us",
+    "end_us",
+    "warmup_us",
+    "latency",
+    "environment",
+    "degradation",
+    "content_hash",
+    "notes",
+    "varied",
+    "files",
+    "standing",
+    "stop_at_path_end",
+}
+
+
+def check_policy(policy: Policy | str, scenario: Scenario | None = None) -> Report:
+    """Drive a policy through the situations and report every breach of the contract.
+
+    A policy with ``controller = "perfect"`` replays a recording, and one that looks up the map, the
+    recording or the road users of its ``scenario`` may follow them: such a policy is driven along
+    the recording alone. What a policy looks up is only noticed where it is made here.
 
     Args:
         policy: A policy made for ``scenario``, or its name (see `make_policy`).
-        scenario: Whose cameras the frames imitate; by default `canned_scenario`.
+        scenario: In which it drives, with whose cameras; by default `canned_scenario`.
 
     Raises:
         InputError: The name is unknown, or its module cannot be imported.
     """
+    place = Place() if scenario is None else Place.of(scenario)
     scenario = canned_scenario() if scenario is None else scenario
     if not isinstance(policy, str):
-        return _checked(policy, scenario)
+        return _checked(policy, scenario, place, set())
+    watched = WatchedScenario.of(scenario)
+    # The canned scenario holds nothing but the straight road of its situations.
+    looked_up = set() if place.recording is None else watched.looked_up
     try:
-        made = make_policy(policy, scenario)
+        made = make_policy(policy, watched)
     except PolicyError as error:
         return Report((Check("made", False, f"{error.message}; {error.hint}"),))
-    report = _checked(made, scenario)
+    report = _checked(made, scenario, place, looked_up)
     with suppress(SimrunError):  # what it did before is the result
         made.close()
     return report
 
 
-def _checked(policy: Policy, scenario: Scenario) -> Report:
-    """Return what a policy does in the situations, one after the other."""
+@dataclass(frozen=True)
+class Place:
+    """When situations are driven, and what is recorded there.
+
+    Attributes:
+        start_us: When each begins.
+        recording: The scenario whose recorded drive is driven as well; None where the straight road
+            is the recorded drive.
+    """
+
+    start_us: int = START_US
+    recording: Scenario | None = None
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Place:
+        """Return the place of a scenario."""
+        return cls(scenario.start_us, scenario)
+
+    def times_us(self, situation: Situation) -> list[int]:
+        """Return when the policy is queried: at the most as long as a recorded drive lasts."""
+        steps = range(situation.first_step, situation.first_step + situation.steps)
+        times_us = [self.start_us + step * STEP_US for step in steps]
+        if self.recording is None or not situation.is_recorded:
+            return times_us
+        last_us = int(self.recording.ego_log.t_us[-1]) - STEP_US  # a plan has two poses
+        return [t_us for t_us in times_us if t_us <= last_us]
+
+    def horizon_s(self, situation: Situation, now_us: int) -> float:
+        """Return how far a plan must reach: along a recorded drive up to the last step before its
+        end.
+        """
+        if self.recording is None or not situation.is_recorded:
+            return MIN_HORIZON_S
+        left_us = int(self.recording.ego_log.t_us[-1]) - now_us
+        return min(MIN_HORIZON_S, left_us * 1e-6 - MAX_STEP_S)
+
+    def route(self, situation: Situation) -> Route:
+        """Return the route of a situation, world, as read-only as a run gives it."""
+        if self.recording is not None and situation.is_recorded:
+            return read_only(self.recording.route)
+        road = PaintedRoad(situation.curvature_1pm)
+        points = [(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)]
+        return Route(np.array(points))
+
+
+def _checked(policy: Policy, scenario: Scenario, place: Place, looked_up: set[str]) -> Report:
+    """Return what a policy does in the situations, one after the other.
+
+    Args:
+        policy: The policy.
+        scenario: Whose cameras the frames imitate.
+        place: Where it is driven.
+        looked_up: What it has read of its scenario that the situations do not have; grows as the
+            policy drives.
+    """
     rig = {camera.name: camera for camera in scenario.cameras}
     fault = sensors_problem(policy.sensors) or _camera_fault(policy, rig)
     if fault:
         return Report((Check("sensors", False, fault),))
     used = sorted({sensor.camera for sensor in policy.sensors})
-    cameras = {name: rig[name] for name in used}
+    drives = _TestDrives(policy, {name: rig[name] for name in used}, place)
     replays = getattr(policy, "controller", "") == "perfect"
-    situations = [STRAIGHT, OLD_FRAME]
-    if not replays:
-        situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK, *(IMAGES if cameras else ())]
-    durations_ms: list[float] = []
-    plans, plan_checks = _plans_in(situations, policy, cameras, durations_ms)
+    plans: dict[str, list[Plan]] = {}
+    plan_checks: list[Check] = []
+    if place.recording is None or not (replays or looked_up):
+        situations = [STRAIGHT, OLD_FRAME]
+        if not replays:
+            situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK]
+            situations += IMAGES if used else ()
+        plans, plan_checks = drives.plans_in(situations)
+    follows_scene = place.recording is not None and (replays or bool(looked_up))
+    if follows_scene:
+        drives = replace(drives, durations_ms=[])
+        plans, plan_checks = drives.plans_in([RECORDED, RECORDED_OLD_FRAME])
     checks = [Check("sensors", True, f"asks for {used or 'no camera'}"), *plan_checks]
     notes: tuple[Check, ...] = ()
     if all(check.ok for check in checks):
-        driving_checks, notes = _driving_checks(policy, cameras, plans, replays)
-        checks += driving_checks
+        checks += [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
+        if follows_scene:
+            checks += _memory_checks(drives, plans[RECORDED.name], RECORDED, RECORDED_LATER)
+        else:
+            way_checks, notes = _way_checks(drives, plans, replays)
+            checks += way_checks
+    if follows_scene:
+        notes = (Check("recording", True, _followed(looked_up)),)
     latency_ms = (0.0, 0.0)
-    if durations_ms:
-        latency_ms = (float(np.median(durations_ms)), max(durations_ms))
+    if drives.durations_ms:
+        latency_ms = (float(np.median(drives.durations_ms)), max(drives.durations_ms))
         sentence = f"plans in {latency_ms[0]:.1f} ms, the limit is {LATENCY_MS:.0f} ms"
         checks.append(Check("latency", latency_ms[0] <= LATENCY_MS, sentence))
     return Report(tuple(checks), notes, latency_ms)
+
+
+def _followed(looked_up: Collection[str]) -> str:
+    """Say why a policy was driven along the recording alone."""
+    reason = "it replays the recording"
+    if looked_up:
+        reason = f"it looks up {', '.join(sorted(looked_up))} of its scenario"
+    return (
+        f"{reason}, so it was driven along the recorded drive alone, where it leads was not checked"
+    )
 
 
 def _camera_fault(policy: Policy, names: Collection[str]) -> str:
@@ -379,52 +531,101 @@ def _camera_fault(policy: Policy, names: Collection[str]) -> str:
     return f"the policy asks for cameras {unknown}; the scenario has {sorted(names)}"
 
 
-def _plans_in(
-    situations: Sequence[Situation],
-    policy: Policy,
-    cameras: dict[str, CameraSpec],
-    durations_ms: list[float],
-) -> tuple[dict[str, list[Plan]], list[Check]]:
-    """Return the plans of a policy by situation, and the first fault of each kind in them."""
-    plans: dict[str, list[Plan]] = {}
-    faults: dict[str, Check] = {}
-    for situation in situations:
-        driven = _drive(policy, situation, cameras, durations_ms)
-        if not isinstance(driven, str):
-            plans[situation.name] = driven
-            fault = _plan_fault(situation, driven)
-            if fault is not None:
-                faults.setdefault(fault.name, fault)
-        elif situation not in IMAGES:  # a policy may need the route
-            text = f"in the situation {situation.name!r} {driven}"
-            faults.setdefault("plans", Check("plans", False, text))
-    return plans, [*faults.values()]
+@dataclass(frozen=True)
+class _TestDrives:
+    """The drives of a policy in a place.
+
+    Attributes:
+        policy: The policy.
+        cameras: Those that it uses.
+        place: Where it is driven.
+        durations_ms: Of its queries, the first of each drive excluded.
+    """
+
+    policy: Policy
+    cameras: dict[str, CameraSpec]
+    place: Place
+    durations_ms: list[float] = field(default_factory=list)
+
+    def plans_in(
+        self, situations: Sequence[Situation]
+    ) -> tuple[dict[str, list[Plan]], list[Check]]:
+        """Return the plans by situation, and the first fault of each kind in them."""
+        plans: dict[str, list[Plan]] = {}
+        faults: dict[str, Check] = {}
+        for situation in situations:
+            driven = self.drive(situation, self.durations_ms)
+            if not isinstance(driven, str):
+                plans[situation.name] = driven
+                fault = self._plan_fault(situation, driven)
+                if fault is not None:
+                    faults.setdefault(fault.name, fault)
+            elif situation not in IMAGES:  # a policy may need the route
+                text = f"in the situation {situation.name!r} {driven}"
+                faults.setdefault("plans", Check("plans", False, text))
+        return plans, [*faults.values()]
+
+    def drive(self, situation: Situation, durations_ms: list[float]) -> list[Plan] | str:
+        """Return the plans, or a sentence where the policy raised."""
+        policy = self.policy
+        plans = []
+        name = f"{type(policy).__name__} in the check"
+        method = "reset"
+        try:
+            with noted(PolicyError, name, defined(policy, method), runs_users_code(policy, method)):
+                policy.reset(0, self.place.route(situation))
+            method = "act"
+            views = observations(situation, self.cameras, self.place)
+            for step, observation in enumerate(views):
+                began = time.perf_counter()
+                with noted(
+                    PolicyError, name, defined(policy, method), runs_users_code(policy, method)
+                ):
+                    plans.append(policy.act(observation))
+                if step:
+                    durations_ms.append(1e3 * (time.perf_counter() - began))
+        except SimrunError as error:
+            return f"the policy failed: {error.message}"
+        except BaseException as error:  # whatever a foreign policy raises is a result of the check
+            if is_interruption(error):
+                raise
+            message = raised(error, defined(policy, method))
+            return f"the policy raised in query {len(plans) + 1}: {message}"
+        return plans
+
+    def _plan_fault(self, situation: Situation, plans: list[Plan]) -> Check | None:
+        """Return the first fault of a situation's plans."""
+        times_us = self.place.times_us(situation)
+        for name, fault_of, _ in PLAN_FAULTS:
+            for now, plan in zip(times_us, plans, strict=True):
+                fault = fault_of(plan, now, self.place.horizon_s(situation, now))
+                if fault:
+                    return Check(name, False, f"in the situation {situation.name!r} {fault}")
+        return None
 
 
-def _driving_checks(
-    policy: Policy, cameras: dict[str, CameraSpec], plans: dict[str, list[Plan]], replays: bool
+def _way_checks(
+    drives: _TestDrives, plans: dict[str, list[Plan]], replays: bool
 ) -> tuple[list[Check], tuple[Check, ...]]:
     """Check where the plans of a policy lead, whose form has no fault, and what it remembers.
 
     Args:
-        policy: The policy.
-        cameras: Those that it uses.
+        drives: Of the policy.
         plans: By situation.
         replays: It drives a recorded way, whatever it sees.
 
     Returns:
         The checks, and remarks that are no faults.
     """
-    straight = plans["straight"]
-    checks = [Check(name, True, sentence) for name, _, sentence in PLAN_FAULTS]
+    straight = plans[STRAIGHT.name]
     fine = "plans lead on along the road, in the rig frame"
-    checks.append(_check("direction", direction_fault(straight), fine))
-    checks += _memory_checks(policy, cameras, straight, OLD_FRAME if replays else SLOW_LEFT)
+    checks = [_check("direction", direction_fault(straight), fine)]
+    checks += _memory_checks(drives, straight, STRAIGHT, OLD_FRAME if replays else SLOW_LEFT)
     if replays:
         return checks, ()
     if all(check.ok for check in checks):
         checks.append(_check("side", side_fault(plans), "no road leads to its wrong side"))
-    slow = _drive(policy, SLOW_LEFT, cameras, [])
+    slow = drives.drive(SLOW_LEFT, [])
     if not slow or isinstance(slow, str):
         return checks, ()
     fault = speed_fault(straight[0], slow[0])
@@ -432,18 +633,29 @@ def _driving_checks(
     return checks, tuple(remarks(plans))
 
 
-def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterator[Observation]:
-    """Yield what the policy sees in a situation: painted frames, history, ego state and route."""
+def observations(
+    situation: Situation, cameras: dict[str, CameraSpec], place: Place | None = None
+) -> Iterator[Observation]:
+    """Yield what the policy sees in a situation: painted frames, history, ego state and route.
+
+    Args:
+        situation: The situation.
+        cameras: Whose frames it sees, by name.
+        place: Where it is; by default that of `canned_scenario`.
+    """
+    place = Place() if place is None else place
+    if situation.is_recorded:
+        yield from _recorded_observations(situation, cameras, place)
+        return
     road = PaintedRoad(situation.curvature_1pm)
 
     def along(t_us: int) -> float:
-        return situation.speed_mps * (t_us - START_US) * 1e-6
+        return situation.speed_mps * (t_us - place.start_us) * 1e-6
 
     def pose(t_us: int) -> F64:
         return T_WORLD_ROAD @ road.pose(along(t_us))
 
-    for step in range(situation.steps):
-        now = START_US + step * STEP_US
+    for step, now in enumerate(place.times_us(situation)):
         painted = road
         ahead = road
         if step >= CHANGE:
@@ -462,67 +674,75 @@ def observations(situation: Situation, cameras: dict[str, CameraSpec]) -> Iterat
             route = np.full_like(route, np.nan)
         yaw_rate = situation.speed_mps * situation.curvature_1pm
         ego = EgoState(now, pose(now), situation.speed_mps, 0.0, yaw_rate)
-        times = np.arange(START_US - 10 * STEP_US, now + 1, STEP_US)
+        times = np.arange(place.start_us - 10 * STEP_US, now + 1, STEP_US)
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
         specs = {name: read_only(camera) for name, camera in cameras.items()}
         yield Observation(now, frames, specs, read_only(ego), read_only(history), route)
 
 
-def _drive(
-    policy: Policy, situation: Situation, cameras: dict[str, CameraSpec], durations_ms: list[float]
-) -> list[Plan] | str:
-    """Return the plans, or a sentence where the policy raised."""
-    road = PaintedRoad(situation.curvature_1pm)
-    plans = []
-    name = f"{type(policy).__name__} in the check"
-    route = np.array([(T_WORLD_ROAD @ road.pose(float(s)))[:3, 3] for s in range(120)])
-    method = "reset"
-    try:
-        with noted(PolicyError, name, defined(policy, method), runs_users_code(policy, method)):
-            policy.reset(0, Route(route))
-        method = "act"
-        for step, observation in enumerate(observations(situation, cameras)):
-            began = time.perf_counter()
-            with noted(PolicyError, name, defined(policy, method), runs_users_code(policy, method)):
-                plans.append(policy.act(observation))
-            if step:
-                durations_ms.append(1e3 * (time.perf_counter() - began))
-    except SimrunError as error:
-        return f"the policy failed: {error.message}"
-    except BaseException as error:  # whatever a foreign policy raises is a result of the check
-        if is_interruption(error):
-            raise
-        message = raised(error, defined(policy, method))
-        return f"the policy raised in query {len(plans) + 1}: {message}"
-    return plans
+def _recorded_observations(
+    situation: Situation, cameras: dict[str, CameraSpec], place: Place
+) -> Iterator[Observation]:
+    """Yield what the policy sees along a recorded drive: states, history and route are recorded,
+    the images are those of a straight road.
+    """
+    scenario = place.recording
+    assert scenario is not None, "only a place with a recording has a recorded drive"
+    log = scenario.ego_log
+    specs = {name: read_only(camera) for name, camera in cameras.items()}
+    road = PaintedRoad()
+    for now in place.times_us(situation):
+        ego = ego_state_from_log(log, now, scenario.vehicle)
+        past = log.t_us <= now
+        poses = interpolate(log, np.unique([*log.t_us[past], now]))
+        history = trajectory_from_poses(np.unique([*log.t_us[past], now]), poses)
+        seen_us = now - situation.frame_age_us
+        driven_m = ego.speed_mps * (seen_us - place.start_us) * 1e-6
+        frames = {}
+        for name, camera in cameras.items():
+            rgb = road.image(camera, road.pose(driven_m), seed=now % 1000)
+            frames[name] = read_only(Frame(seen_us, name, rgb))
+        route = _route_ahead(scenario.route, ego.T_world_rig)
+        yield Observation(now, frames, specs, read_only(ego), read_only(history), route)
 
 
-def _plan_fault(situation: Situation, plans: list[Plan]) -> Check | None:
-    """Return the first fault of a situation's plans."""
-    for name, fault_of, _ in PLAN_FAULTS:
-        for step, plan in enumerate(plans):
-            fault = fault_of(plan, START_US + step * STEP_US)
-            if fault:
-                return Check(name, False, f"in the situation {situation.name!r} {fault}")
-    return None
+def _route_ahead(route: Route, T_world_rig: F64) -> F64:
+    """Return the route ahead ``(20, 3)`` in the rig frame, z = 0; rows of NaN where it ends."""
+    ahead = np.full((20, 3), np.nan)
+    if len(route.xyz) < 2:
+        return ahead
+    begin_m, _ = project(route.xyz, T_world_rig[:2, 3])
+    stations_m = begin_m + 80 / 19 * np.arange(len(ahead))
+    is_on_route = stations_m <= arc_lengths(route.xyz)[-1]
+    points = resample(route.xyz, stations_m[is_on_route])
+    ahead[is_on_route] = transform_points(inverse(T_world_rig), points)
+    ahead[is_on_route, 2] = 0.0
+    return ahead
 
 
 def _memory_checks(
-    policy: Policy, cameras: dict[str, CameraSpec], straight: list[Plan], other: Situation
+    drives: _TestDrives, before: list[Plan], drive: Situation, other: Situation
 ) -> list[Check]:
-    """Compare fresh drives with the one that was driven first of all."""
-    short = replace(STRAIGHT, steps=6)
-    straight = straight[: short.steps]
-    again = _drive(policy, short, cameras, [])
-    _drive(policy, other, cameras, [])  # ends elsewhere, at another speed
-    after = _drive(policy, short, cameras, [])
+    """Compare fresh drives with the one that was driven first of all.
+
+    Args:
+        drives: Of the policy.
+        before: The plans of the first of all.
+        drive: Which situation that was.
+        other: One that ends elsewhere, at another speed.
+    """
+    short = replace(drive, steps=min(drive.steps, 6))
+    before = before[: short.steps]
+    again = drives.drive(short, [])
+    drives.drive(other, [])
+    after = drives.drive(short, [])
     same = "the same seed and observations give the same plans"
-    apart = difference(straight, again)
+    apart = difference(before, again)
     if apart > 0:
         sentence = f"it does not hold that {same}: they differ by up to {apart:.3g} m"
         return [Check("determinism", False, sentence)]
     forgets = "a reset forgets the drive before"
-    apart = difference(straight, after)
+    apart = difference(before, after)
     fault = f"it does not hold that {forgets}: plans differ by up to {apart:.3g} m" if apart else ""
     return [Check("determinism", True, same), _check("reset", fault, forgets)]
 

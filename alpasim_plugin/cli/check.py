@@ -100,7 +100,11 @@ def check_run(run: Run = None, as_json: Json = False) -> None:
 def check_policy(
     policy: Annotated[str, Positional("A policy's name, package.module:Class, or file.py:Class.")],
     scenario: Annotated[
-        str | None, Flag("Scenario whose cameras it receives; default: one ahead.")
+        str | None,
+        Flag(
+            "Scenario that it receives and drives in; default: a straight road with a camera ahead "
+            "and two to the sides."
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:

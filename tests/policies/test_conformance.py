@@ -2,20 +2,24 @@
 sentence.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import Plan, SensorSpec
+from alpasim_plugin.core.types import Plan, Scenario, SensorSpec
 from policies import conformance
-from policies.conformance import canned_scenario, check_policy
+from policies.conformance import WatchedScenario, canned_scenario, check_policy
 from policies.simple import PurePursuit
+from scenarios.load import load_scenario
 from tests.examples import first_of, first_rows_of
 from tests.runs import faulty_policies
 
 SCENARIO = canned_scenario()
+SCENE_POLICIES = Path(__file__).with_name("scene_policies.py")
 
 
 class Honest(PurePursuit):
@@ -218,3 +222,40 @@ def test_blind_policy_passes_with_a_note():
     report = check_policy("constant-velocity")
     assert report.ok
     assert report.notes[0].name == "route_rig"
+
+
+@pytest.mark.parametrize(
+    ("policy", "is_checked_in_situations"),
+    [
+        ("Replays", False),
+        ("FollowsRecording", False),
+        ("FollowsMap", False),
+        ("CountsFromStart", True),
+    ],
+)
+def test_policy_that_looks_up_its_scenario_is_driven_in_it(policy, is_checked_in_situations):
+    report = check_policy(f"{SCENE_POLICIES}:{policy}", load_scenario("smoke/curve"))
+    assert {"determinism", "reset"} <= {check.name for check in report.checks}
+    assert [check for check in report.checks if not check.ok and check.name != "latency"] == []
+    says_why = any(note.name == "recording" for note in report.notes)
+    assert says_why is not is_checked_in_situations
+    is_side_checked = any(check.name == "side" for check in report.checks)
+    assert is_side_checked is is_checked_in_situations
+
+
+def test_fault_along_the_recording_is_found_where_it_ends_soon():
+    scenario = load_scenario("smoke/straight", overrides=("timing.duration_us=900000",))
+    report = check_policy(f"{SCENE_POLICIES}:SwapsAxes", scenario)
+    assert any("the plan moves sideways" in failure for failure in report.failures)
+    assert check_policy(f"{SCENE_POLICIES}:Replays", scenario).ok
+
+
+def test_only_what_the_situations_do_not_have_is_noted_as_looked_up():
+    watched = WatchedScenario.of(SCENARIO)
+    assert isinstance(watched, Scenario)
+    assert watched.cameras == SCENARIO.cameras
+    assert watched.looked_up == set()
+    assert watched.lane_map is SCENARIO.lane_map
+    assert watched.looked_up == {"lane_map"}
+    copy.copy(watched)
+    assert "all" in watched.looked_up

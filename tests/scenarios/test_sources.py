@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.geometry import interpolate
-from alpasim_plugin.runs.recorded_state import ego_state_from_log
+from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import make_actors
 from scenarios.load import load_scenario
 from scenarios.sources import detect

@@ -26,7 +26,7 @@ from alpasim_plugin.lab.training.policy_expert import (
     following_acceleration,
     leader_on,
 )
-from alpasim_plugin.runs.recorded_state import ego_state_from_log
+from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, bodies_from
 from alpasim_plugin.world.path import Path, smooth_path
