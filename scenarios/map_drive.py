@@ -24,7 +24,7 @@ from scenarios.build import TRACKED_EVERY, with_last
 from scenarios.ego_path import grid
 from scenarios.expert import Follower, drive
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
-from scenarios.map_route import STATION_M, LaneGraph, Spot, Way
+from scenarios.map_route import NARROWEST_M, STATION_M, WIDEST_M, LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
 from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
@@ -191,6 +191,11 @@ def _up_to_goal(line: Path, goal_m: float, driven: F64) -> F64:
 
 def _way(draft: SceneDraft, spec: MapSpec, graph: LaneGraph, street: StreetMap) -> Way:
     """Return the route: between two places, or with an end that is drawn."""
+    if not graph.lanes:
+        raise InputError(
+            f"the map has no lane for cars that is {NARROWEST_M:g} to {WIDEST_M:g} m wide everywhere",
+            "use another map, or correct the widths of its lanes",
+        )
     named = spec.route if isinstance(spec.route, MapRoute) else MapRoute()
     places = [_spots(text, graph, street) for text in (named.from_, *named.via, named.to) if text]
     rng = stream(draft.scene_id, draft.spec.seed, "scenario/map/route")

@@ -222,6 +222,8 @@ def test_vehicles_start_apart_keep_apart_and_wait_for_red(tmp_path):
     [
         (road("1", section(0, lane(-1)), length=10),),  # too short for a route
         (road("1", length=100),),  # without lanes
+        (road("1", section(0, lane(-1).replace('a="3.5"', 'a="1.5"')), length=100),),  # too narrow
+        (road("1", section(0, lane(-1).replace('"driving"', '"sidewalk"')), length=100),),
         (road("1", section(0, lane(-1)), length=0, view="<geometry/>"),),  # broken numbers
         (with_signals(road("1", section(0, lane(-1)), length=90), light("7", 98, "<validity/>")),),
     ],
