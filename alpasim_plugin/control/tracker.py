@@ -35,7 +35,8 @@ from alpasim_plugin.core.geometry import (
 from alpasim_plugin.core.interfaces import Controller
 from alpasim_plugin.core.types import F64, EgoState, Trajectory, Vehicle
 
-GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle without a plan does
+GENTLE_BRAKE_MPS2 = 2.0  # what a vehicle does without a plan that it can follow
+LEADS_BEHIND = math.cos(math.radians(120.0))  # of the angle between the heading and the path
 
 MIN_SPACING_M = 0.25  # closer poses say nothing about the path's direction
 _SEARCHED = np.arange(41.0)
@@ -180,9 +181,14 @@ class ReferencePath:
         s = near_s + reach
         point, _ = self.at(s)
         k = int(np.argmin(np.sum((point - xy) ** 2, axis=1)))
-        foot, normal = self.at(s[k : k + 1])
-        along = np.array([normal[0, 1], -normal[0, 0]])
+        foot, _ = self.at(s[k : k + 1])
+        along = self.tangent(float(s[k]))
         return float(s[k] + min(max((xy - foot[0]) @ along, -window_m / 20), window_m / 20))
+
+    def tangent(self, s_m: float) -> F64:
+        """Return the direction ``(2,)`` of the path at a progress."""
+        _, normal = self.at(np.array([s_m]))
+        return np.array([normal[0, 1], -normal[0, 0]])
 
 
 def build_reference_path(plan: Trajectory, t_us: int, origin_xy: F64) -> ReferencePath:
@@ -232,7 +238,8 @@ class PlanTracker(Controller):
 
     A plan that ends is held at its last pose, so a short plan brakes. The vehicle reverses only for
     a plan that drives backwards by more than half a metre; noise around a standing plan neither
-    moves it nor turns the wheel.
+    moves it nor turns the wheel. No vehicle drives forwards along a path that leads more than 120
+    degrees off its heading: it brakes as without a plan.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -268,6 +275,8 @@ class PlanTracker(Controller):
         xy = np.array([now.x_m, now.y_m])
         s_now = reference.project(xy, float(planned[0]), 2.0 + abs(now.speed_mps) * 0.5)
         to_go = planned[1:] - s_now
+        if reference.tangent(s_now) @ direction_of(now.yaw_rad) < LEADS_BEHIND:
+            return Command(now.steer_rad, 0.0, GENTLE_BRAKE_MPS2)
         # What counts is that the plan goes back, not that the car has gone too far.
         goes_back = float(planned[-1] - planned[0]) < -2 * HOLD_MOVE_M
         direction = -1.0 if goes_back and now.speed_mps < HOLD_SPEED_MPS else 1.0

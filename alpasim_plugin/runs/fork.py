@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from alpasim_plugin.core.errors import InfrastructureError, InputError, SimrunError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, PolicyError, SimrunError
 from alpasim_plugin.core.interfaces import Controller, Policy, Renderer, complete
 from alpasim_plugin.core.parts import digest, resolve, resolve_renderer
 from alpasim_plugin.core.types import (
@@ -48,6 +48,7 @@ from alpasim_plugin.runs.cell import (
     users_parts,
 )
 from alpasim_plugin.runs.execute import thread_budget
+from alpasim_plugin.runs.guards import calling
 from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.logged_rollout import LoggedRollout
 from alpasim_plugin.runs.plan import Cell, RunOptions, RunPlan, score_key
@@ -94,8 +95,70 @@ class SwitchedRenderer(Renderer):
         return dict(self.then.facts() or self.first.facts())
 
 
+class OwnFrames(Policy):
+    """A policy that sees the frames of its own cameras at its own periods, as if it drove alone,
+    where another one shares its cameras at a shorter period. What it raises is its fault, by name.
+
+    Args:
+        policy: The policy.
+        scenario: Its cameras' periods are meant by a sensor's interval of 0.
+    """
+
+    def __init__(self, policy: Policy, scenario: Scenario) -> None:
+        self.policy = complete(policy, Policy)
+        self.sensors = policy.sensors
+        self._start_us = scenario.start_us
+        self._period_us = {
+            sensor.camera: scenario.period_us(sensor) for sensor in self.policy.sensors
+        }
+        self._frames: dict[str, Frame] = {}
+
+    def reset(self, seed: int, route: Route) -> None:
+        """Reset the policy, which has seen nothing."""
+        self._frames = {}
+        with calling(self.policy, "reset", PolicyError):
+            self.policy.reset(seed, route)
+
+    def act(self, observation: Observation) -> Plan:
+        """Return the plan of the policy for what it sees of an observation."""
+        frames = self._own(observation.frames)
+        cameras = {name: observation.cameras[name] for name in self._period_us}
+        images = {
+            name: image
+            for name, image in observation.images.items()
+            if name in frames and frames[name] is observation.frames[name]
+        }
+        view = replace(observation, frames=frames, cameras=cameras, images=images)
+        with calling(self.policy, "act", PolicyError):
+            return self.policy.act(view)
+
+    def end(self, frames: Mapping[str, Frame]) -> None:
+        """End the rollout of the policy."""
+        with calling(self.policy, "end", PolicyError):
+            self.policy.end(self._own(frames))
+
+    def close(self) -> None:
+        """Close the policy."""
+        with calling(self.policy, "close", PolicyError):
+            self.policy.close()
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts of the policy."""
+        with calling(self.policy, "facts", PolicyError):
+            return dict(self.policy.facts())
+
+    def _own(self, frames: Mapping[str, Frame]) -> dict[str, Frame]:
+        """Return the newest frames that the policy asked for, among these and earlier ones."""
+        for name, period_us in self._period_us.items():
+            frame = frames.get(name)
+            if frame is not None and (frame.t_us - self._start_us) % period_us == 0:
+                self._frames[name] = frame
+        return dict(self._frames)
+
+
 class SwitchedPolicy(Policy):
-    """Plan with ``first`` before ``at_us`` and with ``then`` from it on.
+    """Plan with ``first`` before ``at_us`` and with ``then`` from it on; each sees its own cameras
+    at its own periods.
 
     Args:
         first: Reset with the rollout's seed.
@@ -103,13 +166,16 @@ class SwitchedPolicy(Policy):
         at_us: When to switch.
         then_seed: Seed of the second policy.
         scenario: Its cameras' periods count.
+
+    Raises:
+        InputError: The two share a camera at periods of which neither can be shown beside the other.
     """
 
     def __init__(
         self, first: Policy, then: Policy, at_us: int, then_seed: int, scenario: Scenario
     ) -> None:
-        self.first = complete(first, Policy)
-        self.then = complete(then, Policy)
+        self.first: Policy = OwnFrames(first, scenario)
+        self.then = self.first if then is first else OwnFrames(then, scenario)
         self.at_us = at_us
         self.then_seed = then_seed
         self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, scenario)
@@ -177,11 +243,30 @@ def merge_sensors(
         first: Cameras of one.
         then: Cameras of the other.
         scenario: Its cameras' periods are meant by a sensor's interval of 0.
+
+    Raises:
+        InputError: A camera's longer period is no multiple of the shorter one, or frames at the
+            shorter one come between queries: then a frame of the longer one would not be drawn.
     """
     joined = {sensor.camera: sensor for sensor in first}
     for sensor in then:
         earlier = joined.get(sensor.camera)
-        if earlier is None or scenario.period_us(sensor) < scenario.period_us(earlier):
+        if earlier is None:
+            joined[sensor.camera] = sensor
+            continue
+        before_us = scenario.period_us(earlier)
+        then_us = scenario.period_us(sensor)
+        shorter_us = min(before_us, then_us)
+        longer_us = max(before_us, then_us)
+        is_shown = longer_us % shorter_us == 0 and shorter_us % scenario.rates.policy_us == 0
+        if before_us != then_us and not is_shown:
+            raise InputError(
+                f"camera {sensor.camera!r}: the logged policy sees it every {before_us} us, the new "
+                f"one every {then_us} us: not both can be shown what they would see alone",
+                "Name a policy with the same period; where the longer period is a multiple of the "
+                "shorter one, and that of the period of plans, two periods are fine.",
+            )
+        if then_us < before_us:
             joined[sensor.camera] = sensor
     return tuple(joined.values())
 

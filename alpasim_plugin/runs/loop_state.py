@@ -24,6 +24,7 @@ from alpasim_plugin.core.geometry import (
     wrap_angle,
     yaw_of,
 )
+from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.core.types import (
     F64,
     I64,
@@ -40,7 +41,6 @@ from alpasim_plugin.core.types import (
     Trajectory,
     read_only,
 )
-from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.route import route_in_rig

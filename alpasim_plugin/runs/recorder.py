@@ -21,6 +21,7 @@ from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.path_end import PathEnd
+from alpasim_plugin.core.recorded_state import ego_states_from_log
 from alpasim_plugin.core.types import (
     F64,
     OPACITY_MEAN,
@@ -47,7 +48,6 @@ from alpasim_plugin.log.run_folder.schema import (
 )
 from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.film import Film
-from alpasim_plugin.core.recorded_state import ego_states_from_log
 
 NO_PLAN = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 4)))
 

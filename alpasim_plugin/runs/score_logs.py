@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError, SimrunError
 from alpasim_plugin.core.files import real, some_of
 from alpasim_plugin.core.files.config import load_yaml
@@ -267,7 +269,8 @@ def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
     """
     if rollout.info["terminated"] or rollout.control_us <= 0 or len(rollout.ego) < 2:
         return
-    recorded = (int(rollout.ego_log.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
+    first_us = int(rollout.ego.t_us[_first_policy_pose(rollout)])
+    recorded = (int(rollout.ego_log.t_us[-1]) - first_us) // rollout.control_us
     steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
     done = _steps(rollout)
     if done < steps and not _ends_with_the_path(rollout, scene):
@@ -280,16 +283,23 @@ def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
 
 def _ends_with_the_path(rollout: RolloutLog, scene: Scene) -> bool:
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
-    return ends_with_path(rig.xyz[1:, :2], scene)
+    return ends_with_path(rig.xyz[_first_policy_pose(rollout) :, :2], scene)
 
 
 def _steps(rollout: RolloutLog) -> int:
-    """Return how many control steps were driven: since the first policy time, which is the second
-    logged pose.
-    """
+    """Return how many control steps were driven, since the first policy time."""
     if len(rollout.ego) < 2 or rollout.control_us <= 0:
         return 0
-    return (int(rollout.ego.t_us[-1]) - int(rollout.ego.t_us[1])) // rollout.control_us
+    first_us = int(rollout.ego.t_us[_first_policy_pose(rollout)])
+    return (int(rollout.ego.t_us[-1]) - first_us) // rollout.control_us
+
+
+def _first_policy_pose(rollout: RolloutLog) -> int:
+    """Return which logged pose is that of the first policy time, when rendering starts: the second
+    one where the recording begins earlier, whose first pose is logged before it.
+    """
+    later = np.searchsorted(rollout.ego.t_us, rollout.render_start_us)
+    return min(int(later), len(rollout.ego) - 1)
 
 
 def run_names(log: Path) -> tuple[str | None, str | None]:

@@ -217,6 +217,27 @@ def test_no_plan_brakes_gently_to_a_stop():
     assert states[-1].speed_mps == 0.0
 
 
+@pytest.mark.parametrize("turn", [np.pi, -2.5])
+@pytest.mark.parametrize("speed", [0.0, 8.0])
+def test_plan_that_leads_behind_the_car_is_braked_for(speed, turn):
+    t = np.arange(0, 8, 0.1)
+    plan = plan_of(t, 8 * t * np.cos(turn), 8 * t * np.sin(turn), turn)
+    states = drive(plan, at(speed=speed), 6.0)
+    speeds_mps = [state.speed_mps for state in states]
+    assert speeds_mps == sorted(speeds_mps, reverse=True)
+    assert speeds_mps[-1] == 0.0
+
+
+def test_u_turn_is_driven():
+    t = np.arange(0, 14, 0.1)
+    angle = np.clip(4 * t / 9, 0, np.pi)
+    beyond_m = np.maximum(4 * t - 9 * np.pi, 0)
+    plan = plan_of(t, 9 * np.sin(angle) - beyond_m, 9 * (1 - np.cos(angle)), angle)
+    states = drive(plan, at(speed=4.0), 10.0)
+    assert np.abs(xy(states)[-1] - [9 * np.pi - 40.0, 18.0]).max() < 0.3
+    assert states[-1].speed_mps == pytest.approx(4.0, abs=0.1)
+
+
 @pytest.mark.parametrize("name", ["bicycle", "perfect"])
 def test_time_that_does_not_advance_is_refused(name):
     with pytest.raises(InputError, match="not later"):

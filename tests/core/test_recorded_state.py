@@ -5,8 +5,8 @@ import pytest
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_yaw
-from alpasim_plugin.core.types import Trajectory, Vehicle
 from alpasim_plugin.core.recorded_state import ego_states_from_log
+from alpasim_plugin.core.types import Trajectory, Vehicle
 
 T_US = (
     np.arange(0, 2_000_001, 50_000, dtype=np.int64) + 1_700_000_000_000_000

@@ -2,12 +2,14 @@
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.types import SensorSpec
 from alpasim_plugin.log import read_asl, read_facts, write_facts
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_run_json
@@ -122,6 +124,24 @@ def test_a_replay_that_leaves_the_log_names_component_and_step(past, tmp_path):
     with pytest.raises(InfrastructureError, match="frames at step 3, camera front"):
         go(moved, tmp_path / "out", renderer="clean")
     assert not (tmp_path / "out" / "run.json").exists()
+
+
+@pytest.mark.slow
+def test_a_policy_that_ends_its_process_after_the_change_is_named(past, tmp_path):
+    result = go(
+        past, tmp_path, policy=f"{Path(__file__).with_name('bad_parts.py')}:policy_end_process"
+    )
+    assert result.exit_code == 2
+    (failed,) = result.summary.failures.cells
+    assert failed.error.failure_class == "policy"
+    assert "bad_parts.py:" in failed.error.message
+
+
+def test_a_new_policy_keeps_the_controller_that_its_run_named(past):
+    named = replace(past.cell, controller=resolve("controller", "perfect"))
+    change = Change(AT_US, policy="pure-pursuit")
+    assert change.apply(named, RunOptions(controller="perfect")).controller.name == "perfect"
+    assert change.apply(named, RunOptions()).controller.name == "bicycle"
 
 
 def test_instants_outside_and_folders_in_use_are_refused(past, root, tmp_path):

@@ -119,6 +119,18 @@ def test_a_score_takes_a_log_that_ends_there_and_refuses_one_cut_before_or_later
             check_complete(Path("rollout.asl"), replace(log, ego=other), scenario.scene)
 
 
+@pytest.mark.parametrize("context_us", [0, 300_000])
+def test_a_score_takes_a_log_of_a_recording_that_begins_with_the_drive(straight_road, context_us):
+    start_us = int(straight_road.ego_log.t_us[0]) + context_us
+    scenario = replace(straight_road, start_us=start_us, end_us=start_us + 1_000_000)
+    log = run_rollout(scenario, Grey(), Standing(), 0).log()
+    check_complete(Path("rollout.asl"), log, scenario.scene)
+    ego = log.ego
+    shorter = Trajectory(ego.t_us[:-1], ego.xyz[:-1], ego.quat[:-1])
+    with pytest.raises(InfrastructureError, match="9 of 10 control steps"):
+        check_complete(Path("rollout.asl"), replace(log, ego=shorter), scenario.scene)
+
+
 def test_it_goes_on_where_the_recorded_car_stands_or_the_scenario_says_so(
     straight_road,
 ):

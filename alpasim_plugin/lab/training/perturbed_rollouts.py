@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alpasim_plugin.core.geometry import se3, yaw_of
+from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Scenario
 from alpasim_plugin.gaussians.scene.log_views import log_actors
@@ -26,7 +27,6 @@ from alpasim_plugin.lab.training.policy_expert import (
     following_acceleration,
     leader_on,
 )
-from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.world.ground import ground_pose
 from alpasim_plugin.world.idm import Bodies, bodies_from
 from alpasim_plugin.world.path import Path, smooth_path
