@@ -22,7 +22,9 @@ from policies.simple import ConstantVelocity
 class Slow(ConstantVelocity):
     """Takes longer with every plan."""
 
-    queries = 0
+    def reset(self, seed, route):
+        super().reset(seed, route)
+        self.queries = 0
 
     def act(self, observation):
         self.queries += 1
