@@ -147,8 +147,8 @@ def _scenario(draft: SceneDraft, drive: RecordedLog, cameras: tuple[CameraSpec, 
     scene_id = spec.scene_id or (draft.scene_id if is_file else drive.scene_id)
     start, end = _window(draft, drive)
     background = _background(draft)
-    # Where the street itself is built its markings are chosen; those that nobody knows of a recorded
-    # street stays unknown.
+    # A street that is built gets markings where its map names none; what is painted on a recorded
+    # street and not in its map stays unknown.
     recorded = drive.source in RECORDED_STREETS or (
         background is not None and not background.keep_road
     )

@@ -279,7 +279,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._observation = observation
         *_, facts = scorer.score(recorder.taken())
         info = {"seed": seed, "scene": scenario.scene_id, "t_us": observation.t_us, **facts}
-        return self._seen(), info
+        return self._values(), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
         """Act for one policy period.
@@ -320,7 +320,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
             }
             cameras = {} if self._camera is None else {self._camera.name: self._camera}
             self._observation = episode.loop.state.observe(cameras)
-        return self._seen(), worth, bool(ended) and not timed_out, timed_out, info
+        return self._values(), worth, bool(ended) and not timed_out, timed_out, info
 
     def render(self) -> U8 | None:
         """Return the newest frame ``(H, W, 3)``; None without render mode."""
@@ -339,14 +339,17 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._episode.folder.cleanup()
         self._episode = None
 
-    def _seen(self) -> dict[str, Any]:
+    def _values(self) -> dict[str, Any]:
+        """Return the newest observation as `observation_space` has it: a point of the route that is
+        not known is 0, and so is its third number.
+        """
         observation = self.observation
         speed = np.clip([observation.ego.speed_mps], -SPEED_MPS, SPEED_MPS)
-        finite = np.isfinite(observation.route_rig).all(axis=1)
-        out = np.zeros((ROUTE_POINTS, 3), dtype=np.float32)
-        out[finite, :2] = np.clip(observation.route_rig[finite, :2], -ROUTE_M, ROUTE_M)
-        out[finite, 2] = 1.0
-        values = {"speed": speed.astype(np.float32), "route": out}
+        is_known = np.isfinite(observation.route_rig).all(axis=1)
+        route = np.zeros((ROUTE_POINTS, 3), dtype=np.float32)
+        route[is_known, :2] = np.clip(observation.route_rig[is_known, :2], -ROUTE_M, ROUTE_M)
+        route[is_known, 2] = 1.0
+        values = {"speed": speed.astype(np.float32), "route": route}
         if self._camera is not None:
             values["camera"] = np.array(observation.frames[self._camera.name].rgb)
         return values

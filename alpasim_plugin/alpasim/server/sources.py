@@ -136,7 +136,7 @@ def boxes_at(entry: SceneEntry, view: View) -> dict[str, F64]:
     return poses | {track: pair[1] for track, pair in view.objects.items()}
 
 
-def asked_of(
+def requests_of(
     entry: SceneEntry, request: Request, view: View, T_rig_camera: F64, sides: Sequence[Lens]
 ) -> list[RenderRequest]:
     """Return what is to be drawn by each pinhole that covers the request's lens; a camera of the
@@ -170,7 +170,7 @@ def drawn_map(
     return joined_image(sides, draw_exposed_maps(scene_map, requests, actors, device=device))
 
 
-def gated(
+def with_fitting_map(
     rendered: Rendered,
     entry: SceneEntry,
     request: RenderRequest,
@@ -247,19 +247,22 @@ class LocalSource:
         ]
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
-        sides = read_sides(request.camera_intrinsics, view.width, view.height)
+        """Render the pinholes that cover the request's lens, join them, and check the semantic map
+        against the one that looks straight ahead.
+        """
+        pinholes = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
-        requests = asked_of(entry, request, view, mount_of(entry, view), sides)
+        requests = requests_of(entry, request, view, mount_of(entry, view), pinholes)
         with left.holding(self._busy):
             frames = entry.render(requests, entry.reads_device)
-            place = frames[0].device if entry.reads_device else "cpu"
-            sdmap = drawn_map(entry, requests, sides, place)
-        frame = joined(view.camera, sides, frames).changed(camera=view.camera)
-        rendered = Rendered(frame, sdmap, blind_of(sides))
+            device = frames[0].device if entry.reads_device else "cpu"
+            sdmap = drawn_map(entry, requests, pinholes, device)
+        frame = joined(view.camera, pinholes, frames).changed(camera=view.camera)
+        rendered = Rendered(frame, sdmap, blind_of(pinholes))
         if sdmap is None:
             return rendered
-        ahead = max(range(len(sides)), key=lambda i: float(sides[i].T_lens_pinhole[2, 2]))
-        return gated(rendered, entry, requests[ahead], frames[ahead].rgb, view)
+        ahead = max(range(len(pinholes)), key=lambda i: float(pinholes[i].T_lens_pinhole[2, 2]))
+        return with_fitting_map(rendered, entry, requests[ahead], frames[ahead].rgb, view)
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.
@@ -395,14 +398,14 @@ class UpstreamSource:
             bare_request = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
             sides = read_sides(bare_request.camera_intrinsics, width, height)
             sized = replace(view, width=width, height=height)
-            requests = asked_of(entry, bare_request, sized, np.eye(4), sides)
+            requests = requests_of(entry, bare_request, sized, np.eye(4), sides)
             sdmap = drawn_map(entry, requests, sides)
             if sdmap is not None:
                 straight = straight_of(bare_request.camera_intrinsics, width, height)
                 mounted = straight.K, mount_of(entry, view)
                 camera = CameraSpec(view.camera, *straight.size, *mounted)
                 straight_image = straight.image(rgb)
-                rendered = gated(
+                rendered = with_fitting_map(
                     replace(rendered, sdmap=sdmap),
                     entry,
                     replace(requests[0], camera=camera, T_world_camera=view.T_world_camera),

@@ -180,55 +180,65 @@ class PolicyTask:
         return lateral, yaw[:, self.rows] - batch.headings, speed - batch.speeds
 
     def _sample(self, number: int, random: np.random.Generator | None) -> tuple[Any, ...]:
+        """Return a sample's images, inputs and targets, in the order of `PolicyBatch`.
+
+        Args:
+            number: Of the sample, over all scenes.
+            random: Draws how it is varied; None leaves it as it is.
+        """
         scene = int(np.searchsorted(self.ends, number, side="right"))
         demonstrations = self.demonstrations[scene]
-        a = demonstrations.arrays
         row = number - int(self.ends[scene] - len(demonstrations))
-        speed = float(a["speed"][row])
-        desired = float(a["desired_speed"][row])
-        real = float(a["frame"][row] != a["before"][row])
-        state = np.array([speed, desired], dtype=np.float32)
+        table = demonstrations.arrays
+        speeds_mps = [float(table["speed"][row]), float(table["desired_speed"][row])]
+        state = np.array(speeds_mps, dtype=np.float32)
         contrast = brightness = 1.0
         if random is not None:
-            contrast, brightness = 1.0 + random.uniform(
-                -self.recipe.brightness_jitter, self.recipe.brightness_jitter, 2
-            )
-            state = state * (1.0 + self.recipe.speed_noise * random.standard_normal(2)).astype(
-                np.float32
-            )
+            jitter = self.recipe.brightness_jitter
+            contrast, brightness = 1.0 + random.uniform(-jitter, jitter, 2)
+            noise = self.recipe.speed_noise * random.standard_normal(2)
+            state = state * (1.0 + noise).astype(np.float32)
+        images = self._images(demonstrations, row, contrast, brightness, random)
+        has_earlier = float(table["frame"][row] != table["before"][row])
+        gap_m = float(table["gap"][row])
+        proximity = 0.0 if gap_m >= SIGHT_M else np.exp(-max(gap_m, 0.0) / PROXIMITY_M)
+        return (
+            images,
+            np.array([*(state / SPEED_UNIT_MPS), has_earlier], dtype=np.float32),
+            table["command"][row],
+            table["points"][row],
+            table["headings"][row],
+            table["speed"][row],
+            table["speeds"][row],
+            np.array([proximity, table["leader"][row]], dtype=np.float32),
+            table["crossing"][row],
+        )
+
+    def _images(
+        self,
+        demonstrations: Demonstrations,
+        row: int,
+        contrast: float,
+        brightness: float,
+        random: np.random.Generator | None,
+    ) -> list[Tensor]:
+        """Return what the network sees in each view, of the newest frame and the one before; with
+        ``random``, some views beside the front one are black.
+        """
+        table = demonstrations.arrays
         images = []
         for view, camera, frames in zip(
             demonstrations.views, demonstrations.cameras, demonstrations.frames, strict=True
         ):
-            now, before = (
-                _jitter_brightness(
-                    level_view(frames[a[frame][row]], camera, float(a[yaw][row]), view),
-                    contrast,
-                    brightness,
-                )
-                for frame, yaw in (("frame", "yaw"), ("before", "yaw_before"))
-            )
+            pair = []
+            for frame, yaw in (("frame", "yaw"), ("before", "yaw_before")):
+                image = level_view(frames[table[frame][row]], camera, float(table[yaw][row]), view)
+                pair.append(_jitter_brightness(image, contrast, brightness))
             if random is not None and view != FRONT and random.random() < self.recipe.black_share:
-                now = np.zeros_like(now)
-                before = np.zeros_like(before)
-            images.append(network_input(in_planes(now), in_planes(before))[0])
-        inputs = np.array([*(state / SPEED_UNIT_MPS), real], dtype=np.float32)
-        gap = float(a["gap"][row])
-        leader = np.array(
-            [0.0 if gap >= SIGHT_M else np.exp(-max(gap, 0.0) / PROXIMITY_M), a["leader"][row]],
-            dtype=np.float32,
-        )
-        return (
-            images,
-            inputs,
-            a["command"][row],
-            a["points"][row],
-            a["headings"][row],
-            a["speed"][row],
-            a["speeds"][row],
-            leader,
-            a["crossing"][row],
-        )
+                pair = [np.zeros_like(image) for image in pair]
+            newest, before = (in_planes(image) for image in pair)
+            images.append(network_input(newest, before)[0])
+        return images
 
 
 def start_from_front(net: LearnedNet, front: LearnedNet) -> None:
