@@ -190,7 +190,7 @@ def _baseline(path: Path, run: Run) -> Baseline:
 
 
 def verdict_lines(verdict: GateVerdict) -> list[str]:
-    """Return a line for every check and every other reason, and the verdict."""
+    """Return a line for every check and every other reason, what they can show, and the verdict."""
     lines = []
     for check in verdict.checks:
         note = "" if check.binding else " (not binding)"
@@ -200,7 +200,7 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     lines += [f"{outcome.cause:>10}  {text}" for text in outcome.reasons if text not in texts]
     code = verdict.exit_code
     title = f"{outcome.title} (exit code {code}), compared with {verdict.baseline}"
-    return [*lines, f"{title}; {verdict.about}"]
+    return [*lines, *verdict.sizes, f"{title}; {verdict.about}"]
 
 
 def _check_suite(suite: str, gate_file: str, other: Path | None, as_json: bool) -> None:

@@ -275,7 +275,10 @@ def check_suite(verdict: GateVerdict, gate: str) -> Suite:
         text = "; ".join(verdict.outcome.reasons)
         cause = verdict.outcome.cause
         cases.append(Case("gate", "verdict", {}, 0.0, "failure", cause, text, text))
-    return Suite(f"gate {gate}", cases)
+    facts = {"about": verdict.about}
+    if verdict.sizes:
+        facts["sizes"] = "; ".join(verdict.sizes)
+    return Suite(f"gate {gate}", cases, facts)
 
 
 def write_gate_files(verdict: GateVerdict, gate: str, run: Run, folder: Path | None) -> list[Path]:

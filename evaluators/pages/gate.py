@@ -121,6 +121,7 @@ def gate_section(run: Run) -> JsonObject | None:
         "gate": stored["gate"],
         "baseline": stored["baseline"],
         "exit_code": outcome["exit_code"],
+        "sizes": stored["sizes"],
         "checks": [check | {"tone": tone_of_cause(check["cause"])} for check in checks],
         "worst": worst,
     }

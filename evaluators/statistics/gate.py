@@ -26,9 +26,11 @@ from evaluators.metrics.presets import preset as find_preset
 from evaluators.results import Cause, Failures, Outcome, Verdict, to_json
 from evaluators.statistics.numbers import plural, short
 from evaluators.statistics.paired import compare, least_scenes
+from evaluators.statistics.power import claim_size_text, size_text
 from evaluators.statistics.sentences import change_text, difference_text
 from evaluators.statistics.suite import (
     LISTED,
+    NOISY_EVENTS,
     ROUNDING,
     Change,
     Noise,
@@ -238,6 +240,7 @@ class GateVerdict:
     failures: Failures
     baseline: str  # what was compared with, in words
     about: str  # what it is about, in words
+    sizes: tuple[str, ...] = ()  # what pairs or scenes as many as these can show, in sentences
     accepts_failures: bool = False  # rollouts failed, and no more than the gate accepts
 
     @property
@@ -256,6 +259,7 @@ class GateVerdict:
             "outcome": self.outcome.as_dict(),
             "baseline": self.baseline,
             "about": self.about,
+            "sizes": list(self.sizes),
             "failures": {
                 "n_rollouts": self.failures.n_rollouts,
                 "n_failed": self.failures.n_failed,
@@ -341,7 +345,37 @@ def check_gate(
         name = f"{kind}{base.name} of the same run"
     about = SCENES if spec.population == "scenes" else SUITE[repeatable]
     accepts_failures = failures.n_failed > 0 and of_failures.cause == "pass"
-    return GateVerdict(worst(outcomes), tuple(checks), failures, name, about, accepts_failures)
+    sizes = _sizes(checks, spec, known, is_noisy=repeatable is False)
+    return GateVerdict(
+        worst(outcomes), tuple(checks), failures, name, about, sizes, accepts_failures
+    )
+
+
+def _sizes(
+    checks: Sequence[Check], spec: GateSpec, known: MetricTable, is_noisy: bool
+) -> tuple[str, ...]:
+    """Say what as many pairs or scenes as were compared can show about events, once for each number:
+    variants may have different ones, and rules may accept different numbers of new events. Limits
+    compare nothing.
+    """
+    member = "n_scenes" if spec.population == "scenes" else "n_cells"
+    by_variant: dict[Variant, int] = {}
+    for check in checks:
+        if check.kind == "margin" and check.entry[member]:
+            variant = Variant(check.renderer, check.policy)
+            by_variant[variant] = max(by_variant.get(variant, 0), check.entry[member])
+    numbers = sorted(set(by_variant.values()))
+    if spec.population == "scenes":
+        return tuple(claim_size_text(n) for n in numbers)
+    accepted = {
+        rule.new_of(spec.max_new)
+        for name, rule in spec.metrics.items()
+        if rule.is_paired and known.info(name).is_flag
+    }
+    needed = {n_new + 1 for n_new in accepted or {spec.max_new}}
+    if is_noisy:
+        needed = {max(NOISY_EVENTS, n_new) for n_new in needed}
+    return tuple(size_text(n, n_new, is_noisy) for n in numbers for n_new in sorted(needed))
 
 
 def _sides(table: RolloutTable) -> Sides:

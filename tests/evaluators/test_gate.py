@@ -16,6 +16,7 @@ from evaluators.statistics.gate import (
     load_gate,
     shipped_gates,
 )
+from evaluators.statistics.power import chance_seen
 from evaluators.statistics.verdicts import SEVERITY, outcome_of_failures, worst, worst_code
 from tests.evaluators.gate_tables import SCENES, add, rows, table_of
 
@@ -287,6 +288,37 @@ def test_an_undecided_gate_says_how_many_seeds_would_decide():
     assert undecided["offroad"].entry["seeds"] == 3
     assert "3 seeds" in undecided["offroad"].text.replace("\u00a0", " ")
     assert code(often(0.0, 1), seeds=3, is_noisy=True) == 0
+
+
+# --- what a suite of this size can show
+
+
+def test_a_gate_says_what_as_many_pairs_as_were_compared_can_show():
+    def sizes(spec=None, repeatable=None, **size):
+        run = [*rows("clean", **size), *rows(**size)]
+        verdict = judged(run, spec or gate(), repeatable=repeatable)
+        assert verdict.as_dict()["sizes"] == list(verdict.sizes)
+        return [text.replace("\u00a0", " ") for text in verdict.sizes]
+
+    seen = "an event that is new in 5, 10, 20 % of drives is seen with a chance of"
+    assert sizes() == [f"14 pairs: {seen} 51, 77, 96 %"]
+    assert sizes(scenes=3, seeds=2) == [f"6 pairs: {seen} 26, 47, 74 %"]
+    assert sizes(gate(max_new=1)) == [f"14 pairs: {seen} 15, 42, 80 % (it takes 2 new ones)"]
+    noisy = sizes(repeatable=False, scenes=42)
+    assert noisy == [f"42 pairs: {seen} 2, 24, 87 % (it takes 6 new ones and none gone)"]
+    limits = gate(metrics={"img_is_black": MetricRule(max=0.0)})
+    assert sizes(limits) == []
+    others = {name: rule for name, rule in RULES.items() if rule.must_decide}
+    (claim,) = sizes(gate(population="scenes", metrics=others), scenes=200)
+    assert claim.endswith("its rate in others has risen by less than 1.8 points")
+
+
+def test_the_chances_under_a_gate_are_those_of_drawn_gates():
+    rng = np.random.Generator(np.random.Philox(4))
+    red = np.mean([rng.random(14).min() < 0.05 for _ in range(2000)])
+    assert chance_seen(0.05, 14) == pytest.approx(red, abs=0.03)
+    red = np.mean([np.sum(rng.random(42) < 0.2) >= 6 for _ in range(2000)])
+    assert chance_seen(0.2, 42, 6) == pytest.approx(red, abs=0.03)
 
 
 # --- what scenes stand for

@@ -39,6 +39,9 @@ def test_a_red_gate_names_the_worst_scenes_first_and_only_for_these_rollouts(usu
     assert page.index('id="gate"') < page.index('id="results"')
     assert section["worst"][0]["scene"] in page[page.index('id="table-gate-worst"') :]
     text = (root / "gate.md").read_text()
+    (size,) = verdict.sizes
+    for place in (text, page, (root / "gate.junit.xml").read_text()):
+        assert size.replace("\u00a0", " ") in place.replace("\u00a0", " ")
     assert section["worst"][0]["scene"] in text
     assert all(row.name in text for row in overview_of(run).rows)
     assert {file.name for file in files} <= stated_files(root).keys()
