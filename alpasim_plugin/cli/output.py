@@ -296,9 +296,12 @@ def describe(manifest: Manifest, reused: bool) -> str:
         cell = f"{manifest.rollout}: {cell}"
     if not manifest.ok:
         return f"{cell}: FAILED ({manifest.failure_class})"
-    from evaluators.metrics.outcomes import NO_OUTCOME, event_words  # a listing needs no metrics
+    from evaluators.metrics.outcomes import (
+        NO_OUTCOME,
+        events_in_words,
+    )  # a listing needs no metrics
 
-    events = dict.fromkeys(event_words(event.metric) for event in manifest.events)
+    events = events_in_words(manifest.events)
     cost = " (reused)" if reused else f", {manifest.wall_s:.1f} s"
     if manifest.copied_from is not None and not reused:
         cost = f" (copied from {manifest.copied_from})"

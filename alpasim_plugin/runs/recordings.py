@@ -22,7 +22,7 @@ from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lazy import require_library
 from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
-from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, series_by_cell
+from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, series_by_rollout
 from evaluators.pages.cells import Logs, WatchedCell
 from evaluators.pages.images import NO_FRAMES, Source, sources
 from evaluators.pages.rollouts import events_of
@@ -241,7 +241,7 @@ def _rollout_items(
         lines += [_line(sample.xyz, color, THIN_M, SAMPLE_ALPHA) for sample in plan.samples]
         entity = _entity(plan.now_us, "plan", lines=lines)
         yield _update(plan.now_us, f"/{label}/plan", [entity])
-    series = series_by_cell(run.steps_of(rollout))
+    series = series_by_rollout(run.steps_of(rollout))
     yield from _metrics(next(iter(series.values()), {}), label)
     for event in events_of(rollout, series):
         if event.t_us is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
+from alpasim_plugin.core.types import F64, I64, STANDING_ID, Bool, MetricSeries, RolloutLog, Scene
 from alpasim_plugin.log.run_folder.records import Contact
 from evaluators.metrics import nuplan
 from evaluators.metrics.contact import (
@@ -19,6 +19,7 @@ from evaluators.metrics.contact import (
     REAR,
     Contacts,
     SweptContacts,
+    begin_at_steps,
     find_contacts,
     find_swept,
     last_per_step,
@@ -28,9 +29,12 @@ from evaluators.metrics.presets import Preset
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.metrics.score import handover_us, series, with_preset
 from evaluators.metrics.scored import ScoredRollout
+from evaluators.metrics.states import velocity_at
 
 SIDES = {FRONT: "front", REAR: "rear", LATERAL: "lateral"}
 NO_CONTACT = "nothing touches the ego"
+NO_IMPACT = "no contact begins at this step while the policy drives"
+NO_SPEED = "a road user that touches the ego has one pose: its velocity is not known"
 
 
 @dataclass(frozen=True)
@@ -103,18 +107,23 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
     if is_last_only:
         contacts = last_per_step(contacts, ego, actors, t_us)
     first = []
+    begun_row, begun_actor = begin_at_steps(contacts, len(actors), len(t_us))
     if preset.contact == "between_steps":
         swept = find_swept(ego, actors, t_us, contacts, handover_us(rollout))
         contacts = Contacts(swept.step, swept.actor, swept.side)
         first = _first_contacts(rollout, swept)
+        begun_row, begun_actor = swept.begun
         gap_m[swept.step] = 0.0
     touched = np.zeros((3, len(t_us)), dtype=np.bool_)
     touched[contacts.side, contacts.step] = True
+    drive = None
+    if len(contacts.step) and not preset.aliases:
+        drive = ScoredRollout(rollout, scene, preset, rollout.ego)
     flags = {"collision_any": touched.any(axis=0)}
     if not is_last_only:
         flags["collision_at_fault"] = touched[FRONT] | touched[LATERAL]
         if preset.fault == "nuplan":
-            flags["collision_at_fault"] = _by_fault_of_ego(rollout, scene, preset, contacts)
+            flags["collision_at_fault"] = _by_fault_of_ego(drive, contacts, len(t_us))
     flags["collision_front"] = touched[FRONT]
     flags["collision_lateral"] = touched[LATERAL]
     flags["collision_rear"] = touched[REAR]
@@ -128,17 +137,66 @@ def evaluate_collision(rollout: RolloutLog, scene: Scene, preset: Preset) -> lis
         "no other actor is present",
         keep_values=not preset.honour_valid,
     )
-    return [*(series(name, t_us, fired) for name, fired in flags.items()), nearest, *first]
+    impacts = [] if preset.aliases else [_impacts(rollout, drive, begun_actor, begun_row)]
+    return [
+        *(series(name, t_us, fired) for name, fired in flags.items()),
+        nearest,
+        *first,
+        *impacts,
+    ]
 
 
-def _by_fault_of_ego(rollout: RolloutLog, scene: Scene, preset: Preset, contacts: Contacts) -> Bool:
-    """Return ``(T,)`` whether the ego is at fault for a contact by nuPlan's rules: it moves, and it
-    touches what stands, or somebody with its front, or at its side while no lane holds it.
+def _impacts(
+    rollout: RolloutLog, drive: ScoredRollout | None, actor: I64, step: I64
+) -> MetricSeries:
+    """Give the greatest relative speed at each step at which a contact begins while the policy
+    drives.
+
+    Args:
+        rollout: The log.
+        drive: Its states; None where nothing touches the ego.
+        actor, step: ``(B,)`` which road users begin to touch the ego, and the first step of each
+            contact.
     """
-    fired = np.zeros(len(rollout.ego.t_us), dtype=np.bool_)
-    if not len(contacts.step):
+    t_us = rollout.ego.t_us
+    speed_mps = np.full(len(t_us), np.nan)
+    reason = NO_CONTACT if drive is None else NO_IMPACT
+    begun = t_us[step] >= handover_us(rollout)
+    if drive is not None and begun.any():
+        impact_mps = relative_mps(drive, rollout, actor[begun], step[begun])
+        np.fmax.at(speed_mps, step[begun], impact_mps)
+        reason = NO_IMPACT if np.isfinite(speed_mps).any() else NO_SPEED
+    return series("impact_speed_mps", t_us, speed_mps, np.isfinite(speed_mps), reason)
+
+
+def relative_mps(drive: ScoredRollout, rollout: RolloutLog, actor: I64, step: I64) -> F64:
+    """Return the size ``(B,)`` of the difference of both velocities at steps, m/s; of a road user
+    that is not there at the step its last one before, or that of its track; NaN where it has one
+    pose alone.
+    """
+    ego = drive.ego
+    tracks = drive.tracks
+    out = np.full(len(step), np.nan)
+    for k, (a, row) in enumerate(zip(actor.tolist(), step.tolist(), strict=True)):
+        rows = np.flatnonzero(tracks.is_present[a, : row + 1])
+        track = rollout.actors[tracks.ids[a]].track
+        if len(rows) and int(tracks.is_present[a].sum()) > 1:
+            velocity = tracks.velocity[a, rows[-1]]
+        elif len(track) > 1:
+            velocity = velocity_at(track, int(ego.t_us[row]))
+        else:
+            continue
+        out[k] = np.hypot(*(ego.velocity[row, 0] * ego.heading[row] - velocity))
+    return out
+
+
+def _by_fault_of_ego(drive: ScoredRollout | None, contacts: Contacts, count: int) -> Bool:
+    """Return at which of ``count`` steps the ego is at fault for a contact by nuPlan's rules: it moves,
+    and it touches what stands, or somebody with its front, or at its side while no lane holds it.
+    """
+    fired = np.zeros(count, dtype=np.bool_)
+    if drive is None:
         return fired
-    drive = ScoredRollout(rollout, scene, preset, rollout.ego)
     tracks = drive.tracks
     step = contacts.step
     actor = contacts.actor

@@ -91,6 +91,18 @@ def find_contacts(ego: Footprints, actors: ActorTable, t_us: I64) -> tuple[Conta
     return Contacts(step, actor, side.astype(np.int64)), gap_m
 
 
+def begin_at_steps(contacts: Contacts, n_actors: int, n_steps: int) -> tuple[I64, I64]:
+    """Return at which steps ``(B,)`` which actors ``(B,)`` touch the ego that do not touch it at
+    the step before.
+    """
+    touch = np.zeros((n_actors, n_steps), np.bool_)
+    touch[contacts.actor, contacts.step] = True
+    before = np.zeros_like(touch)
+    before[:, 1:] = touch[:, :-1]
+    actor, step = np.nonzero(touch & ~before)
+    return step, actor
+
+
 def last_per_step(contacts: Contacts, ego: Footprints, actors: ActorTable, t_us: I64) -> Contacts:
     """Keep of each step's contacts the one that the spatial index names last.
 
@@ -141,6 +153,14 @@ class SweptContacts:
     def side(self) -> I64:
         """Side of each row's contact."""
         return self.onsets.side[self.begin]
+
+    @property
+    def begun(self) -> tuple[I64, I64]:
+        """Give the first row ``(B,)`` and the actor ``(B,)`` of each contact."""
+        begin, first = np.unique(self.begin, return_index=True)
+        row = np.full(len(begin), np.iinfo(np.int64).max)
+        np.minimum.at(row, np.searchsorted(begin, self.begin), self.step)
+        return row, self.actor[first]
 
 
 @dataclass(frozen=True)

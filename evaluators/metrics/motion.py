@@ -1,5 +1,5 @@
 """How the ego moves, also where nothing is touched: comfort, braking, time to collision, who is
-ahead, wrong way, red light, impact.
+ahead, wrong way, red light.
 
 The bounds are nuPlan's (`evaluators.metrics.nuplan`), the safe distance is that of
 responsibility-sensitive safety: Shalev-Shwartz et al., "On a formal model of safe and scalable
@@ -11,16 +11,15 @@ import numpy as np
 from alpasim_plugin.core.types import F64, MetricSeries, RolloutLog, Scene
 from evaluators.metrics import nuplan
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.score import handover_us, series, with_preset
+from evaluators.metrics.score import series, with_preset
 from evaluators.metrics.scored import ScoredRollout
-from evaluators.metrics.states import EgoStates, Tracks
+from evaluators.metrics.states import EgoStates, Tracks, smooth
 
 RESPONSE_S = 1.0
 RSS_ACCEL_MPS2 = 3.5
 RSS_BRAKE_MPS2 = 4.0
 RSS_MOST_BRAKE_MPS2 = 8.0
 NO_ONE_AHEAD = "nobody is ahead in the ego's way"
-NO_CONTACT = "nothing touches the ego"
 NO_LANES = "the map has no lanes"
 NO_STATES = "the states of traffic lights are not known"
 FEW = "the log has three steps or fewer"
@@ -97,15 +96,11 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
         else np.zeros(len(t_us), dtype=np.bool_)
     )
     margin_m = rss_margin_m(drive.ego, drive.tracks)
-    impact_mps = np.full(len(t_us), np.nan)
-    for hit in drive.hits:
-        if t_us[hit.step] >= handover_us(rollout) and np.isnan(impact_mps[hit.step]):
-            impact_mps[hit.step] = hit.delta_v_mps / nuplan.MASS_SHARE
     return [
         series(
             "hard_brake",
             t_us,
-            False if moves is None else moves["lon_accel"] < nuplan.COMFORT["lon_accel"][0],
+            False if not enough else smooth(drive.ego.accel[:, 0]) < nuplan.COMFORT["lon_accel"][0],
             enough,
             FEW,
         ),
@@ -122,7 +117,6 @@ def evaluate_motion(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[M
             np.minimum(time_to_collision_s(drive.ego, drive.tracks), nuplan.TTC_HORIZON_S),
         ),
         series("rss_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_ONE_AHEAD),
-        series("impact_speed_mps", t_us, impact_mps, np.isfinite(impact_mps), NO_CONTACT),
         series("wrong_way", t_us, against, drive.has_map, NO_LANES),
         series(
             "red_light",

@@ -44,6 +44,7 @@ FAR_AGAINST_M = 6.0
 WEIGHTS = {"progress": 5.0, "time_to_collision": 5.0, "speed_limit": 4.0, "comfort": 2.0}
 MULTIPLIERS = ("no_at_fault_collision", "drivable_area", "making_progress", "driving_direction")
 
+Place = Literal["centre", "rear_axle"]
 Type = Literal["stopped_ego", "stopped_track", "active_rear", "active_front", "active_lateral"]
 
 
@@ -204,16 +205,23 @@ def touching_s(ego: EgoStates, tracks: Tracks, actor: I64, step: I64) -> tuple[F
     return first_s, last_s
 
 
-def motion(ego: EgoStates) -> dict[str, F64]:
+def motion(ego: EgoStates, place: Place = "centre") -> dict[str, F64]:
     """Return the series ``(T,)`` that comfort is judged by, under the names of `COMFORT`, and
     ``accel``, the acceleration's magnitude.
+
+    Args:
+        ego: The drive.
+        place: Where accelerations along and across the vehicle are taken: nuPlan takes those of the
+            box's centre (its `extract_ego_acceleration`), NAVSIM those of the rear axle. The
+            magnitude, and the jerk made of it, are the rear axle's in both.
 
     Raises:
         EvaluatorError: Three instants or fewer.
     """
+    along_and_across = ego.centre_accel if place == "centre" else ego.accel
     accel = {
-        "lon_accel": ego.accel[:, 0],
-        "lat_accel": ego.accel[:, 1],
+        "lon_accel": along_and_across[:, 0],
+        "lat_accel": along_and_across[:, 1],
         "accel": np.hypot(ego.accel[:, 0], ego.accel[:, 1]),
     }
     out = {name: smooth(values) for name, values in accel.items()}

@@ -115,29 +115,58 @@ def in_words(had: Iterable[str]) -> str:
 
 
 def first_failure(events: Iterable[DriveEvent]) -> DriveEvent | None:
-    """Return the event of a rollout with which its drive failed first, a contact at any side among
-    them; None where it did not.
+    """Return the event of a rollout with which its drive failed first, among those that its outcome
+    names; None where it did not fail.
 
     Example:
-        >>> events = [DriveEvent("offroad", 9, 0.9, 0.0, 0.0), DriveEvent("collision_front", 5, 0.5, 0.0, 0.0)]
-        >>> first_failure(events).metric
+        >>> def event(metric, t_us):
+        ...     return DriveEvent(metric, t_us, t_us * 1e-6, 0.0, 0.0)
+        >>> first_failure([event("offroad", 9), event("collision_front", 5)]).metric
         'collision_front'
+        >>> first_failure([event("collision_rear", 2), event("collision_at_fault", 5)]).metric
+        'collision_at_fault'
     """
-    failures = [
-        event for event in events if event.metric in OUTCOMES or event.metric in CONTACT_SIDES
-    ]
+    began = outcome_events(events)
+    failures = (began[outcome.name] for outcome in told(began))
     return min(failures, key=lambda event: event.t_us, default=None)
 
 
-def event_words(metric: str) -> str:
-    """Name an event of a manifest: an outcome, another metric with a label, or the side of a
-    contact as the collision that it is.
+def outcome_events(events: Iterable[DriveEvent]) -> dict[str, DriveEvent]:
+    """Return OUTCOME -> the event of a rollout with which it began, by time. A contact at any side
+    is a collision; only an event of that name is an at-fault collision.
     """
-    return (
-        OUTCOMES[metric].words
-        if metric in OUTCOMES
-        else METRICS.shown(metric).label or OUTCOMES["collision_any"].words
-    )
+    began: dict[str, DriveEvent] = {}
+    for event in sorted(events, key=lambda event: event.t_us):
+        name = outcome_of(event)
+        if name in OUTCOMES:
+            began.setdefault(name, event)
+    return began
+
+
+def outcome_of(event: DriveEvent) -> str:
+    """Return the outcome that an event makes, or its metric where it makes none."""
+    return "collision_any" if event.metric in CONTACT_SIDES else event.metric
+
+
+def events_in_words(events: Iterable[DriveEvent]) -> list[str]:
+    """Name the events of a manifest by time: its outcomes, as far as they are named, and other
+    metrics with a label.
+
+    Example:
+        >>> names = "hard_brake", "collision_front", "collision_at_fault"
+        >>> events_in_words(DriveEvent(name, 0, 0.0, 0.0, 0.0) for name in names)
+        ['hard brake', 'at-fault collision']
+    """
+    in_order = sorted(events, key=lambda event: event.t_us)
+    words = {outcome.name: outcome.words for outcome in told(outcome_events(in_order))}
+    words |= {
+        event.metric: METRICS.shown(event.metric).label
+        for event in in_order
+        if event.metric not in OUTCOMES
+    }
+    if "collision_any" in words:
+        words |= dict.fromkeys(CONTACT_SIDES, words["collision_any"])
+    return list(dict.fromkeys(word for event in in_order if (word := words.get(event.metric))))
 
 
 def has_ended(rollout: Rollout) -> bool:

@@ -92,7 +92,7 @@ def _nuplan(
         "progress": progress,
         "time_to_collision": ego.time_to_collision(),
         "speed_limit": ego.speed_limit(),
-        "comfort": ego.comfort(),
+        "comfort": ego.comfort("centre"),
     }
 
 
@@ -108,7 +108,7 @@ def _navsim(
         "ep": _progress(rollout, preset, centre, ego_progress),
         "ttc": ego.time_to_collision(),
         "lk": ego.lane_keeping(),
-        "hc": ego.comfort(),
+        "hc": ego.comfort("rear_axle"),
         "ec": _extended_comfort(rollout, preset, centre),
     }
 

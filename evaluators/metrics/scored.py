@@ -168,18 +168,13 @@ class ScoredRollout:
             np.where(np.isfinite(allowed), self.ego.speed - allowed, 0.0), self.ego.t_us
         )
 
-    @cached_property
-    def uncomfortable(self) -> Bool:
-        """Where ``(T,)`` a bound of comfort is broken."""
-        return nuplan.uncomfortable(nuplan.motion(self.ego))
-
-    def comfort(self) -> Part:
-        """Return whether the drive is within nuPlan's bounds of comfort."""
-        return (
-            SHORT
-            if len(self._xyz) <= nuplan.LEAST_INSTANTS
-            else float(not self.uncomfortable.any())
-        )
+    def comfort(self, place: nuplan.Place) -> Part:
+        """Return whether the drive is within nuPlan's bounds of comfort, by accelerations at a place
+        of the vehicle.
+        """
+        if len(self._xyz) <= nuplan.LEAST_INSTANTS:
+            return SHORT
+        return float(not nuplan.uncomfortable(nuplan.motion(self.ego, place)).any())
 
     def lane_keeping(self) -> Part:
         """Return whether the ego never stays farther from the middle of its lane than `LANE_M` for

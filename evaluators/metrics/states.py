@@ -37,8 +37,9 @@ class EgoStates:
         t_us: ``(T,)`` times.
         rear_xy: ``(T, 2)`` rear axle.
         yaw: ``(T,)``.
-        velocity: ``(T, 2)`` along and to the left of the vehicle, m/s.
-        accel: ``(T, 2)`` the same, m/s2.
+        velocity: ``(T, 2)`` of the rear axle, along and to the left of the vehicle, m/s.
+        accel: ``(T, 2)`` the same, m/s2, of the rear axle.
+        centre_accel: ``(T, 2)`` the same of the centre of the box.
         size: length and width, m.
         ahead_m: From the rear axle to the centre of the box.
     """
@@ -48,6 +49,7 @@ class EgoStates:
     yaw: F64
     velocity: F64
     accel: F64
+    centre_accel: F64
     size: tuple[float, float]
     ahead_m: float
 
@@ -110,16 +112,22 @@ def ego_states(rollout: RolloutLog, preset: Preset, rear: Trajectory, origin: F6
     vectors = _rate(rear_xy, t_us)
     velocity = in_axes(vectors, yaw)
     # d/dt of a velocity given in the turning axes: its own rate, and what the turning adds.
-    turn = _rate(yaw, t_us)[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
+    yaw_rate = _rate(yaw, t_us)
+    turn = yaw_rate[:, None] * np.stack([-velocity[:, 1], velocity[:, 0]], axis=1)
+    accel = _rate(velocity, t_us) + turn
+    # The centre lies ahead of the rear axle: turning pulls it back, and turning faster to the side.
+    ahead_m = float(rollout.T_rig_box[0, 3])
+    swing = ahead_m * np.stack([-(yaw_rate**2), _rate(yaw_rate, t_us)], axis=1)
     size = preset.ego_size_m or (rollout.ego_box.length_m, rollout.ego_box.width_m)
     return EgoStates(
         t_us,
         rear_xy,
         yaw,
         velocity,
-        _rate(velocity, t_us) + turn,
+        accel,
+        accel + swing,
         size,
-        float(rollout.T_rig_box[0, 3]),
+        ahead_m,
     )
 
 
@@ -153,6 +161,14 @@ def _rate(values: F64, t_us: I64) -> F64:
     one.
     """
     return np.zeros_like(values) if len(values) < 2 else np.gradient(values, t_us * 1e-6, axis=0)
+
+
+def velocity_at(track: Trajectory, t_us: int) -> F64:
+    """Return the velocity ``(2,)`` of a track of two poses or more at the pose nearest to a time,
+    m/s, world axes.
+    """
+    nearest = int(np.argmin(np.abs(track.t_us - t_us)))
+    return _rate(track.xyz[:, :2], track.t_us)[nearest]
 
 
 def smooth(values: F64) -> F64:

@@ -428,7 +428,7 @@ METRICS = MetricTable(
         ),
         "uncomfortable": _flag(
             "an acceleration, a jerk or the turning is beyond nuPlan's bounds of comfort",
-            reference="rear axle",
+            reference="box centre along and across, rear axle in all",
             invalid=_FEW,
             formula="outside one of: acceleration -4.05 to 2.40 along and 4.89 m/s2 across, jerk 4.13 along and 8.37 m/s3 in all, yaw 0.95 "
             "rad/s and 1.93 rad/s2",
@@ -458,8 +458,8 @@ METRICS = MetricTable(
             "relative speed at the first contact with a road user",
             limits=(0.0, None),
             reference=FOOTPRINT,
-            formula="size of the difference of both velocities at the first step of a contact",
-            invalid=_NO_CONTACT,
+            formula="size of the difference of both velocities at the first step at or after the beginning of a contact",
+            invalid="steps at which no contact begins",
         ),
         "wrong_way": _flag(
             "the ego has driven 2 m against its lanes within the last second",

@@ -33,22 +33,22 @@ def still_map(
         scene: Its name.
         content: ``scenes/SCENE.json``, with a recorded drive of two points or more.
         rollouts: Its rollouts.
-        series: Pose and event series, by cell.
+        series: Pose and event series, by rollout.
         variant_of: (renderer, policy) -> (colour index, dash index).
     """
     log = content["ego_log"]
     vehicle = content["vehicle"]
     recorded = np.column_stack([log["x_m"], log["y_m"]]).astype(np.float64)
     names_policy = len({rollout.policy for rollout in rollouts}) > 1
-    driven = [one for one in rollouts if "ego_x_m" in series.get(one.cell, {})]
-    ends_us = [series[one.cell]["ego_x_m"][0][[0, -1]] for one in driven]
+    driven = [one for one in rollouts if "ego_x_m" in series.get(one.key, {})]
+    ends_us = [series[one.key]["ego_x_m"][0][[0, -1]] for one in driven]
     first_us = int(min((ends[0] for ends in ends_us), default=0))
     last_us = int(max((ends[1] for ends in ends_us), default=0))
     place = Place(recorded[0], clock_zero_us(content, first_us))
     tracks = []
     for rollout in driven:
         colour, dash = variant_of[rollout.renderer, rollout.policy]
-        x, y = (series[rollout.cell][name][1] for name in ("ego_x_m", "ego_y_m"))
+        x, y = (series[rollout.key][name][1] for name in ("ego_x_m", "ego_y_m"))
         tracks.append(
             {"colour": colour, "dash": dash, "line": path(np.column_stack([x, y]), place)}
         )

@@ -51,7 +51,7 @@ from evaluators.pages.drive_data import (
     scene_of,
     user_data,
 )
-from evaluators.pages.evidence import plan_facts
+from evaluators.pages.evidence import contact_of_failure, plan_facts
 from evaluators.pages.images import frame_rows, jpeg, seen_before
 from evaluators.pages.page import as_json, fill
 from evaluators.pages.rollouts import clock_zero_us
@@ -173,10 +173,11 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
             sentences.append(f"{CHECK}{text}.")
     if log is not None and rollout.ok:
         ended_us = int(log.ego.t_us[-1]) if outcome == SHORT_OF_END else failed_us
-        contacts = () if manifest is None else manifest.contacts
-        met = contacts[0].actor_id if contacts else ""
+        contact = None
+        if manifest is not None and first is not None:
+            contact = contact_of_failure(log, first, manifest.contacts)
         if ended_us is not None:
-            sentences += plan_facts(log, ended_us, outcomes, met)
+            sentences += plan_facts(log, ended_us, outcomes, contact)
     sentences += [
         f"Plans part from those of the {parting.kind} {parting.name} at {parting.at_s:.1f} s, "
         f"by {parting.gap_m:.2f} m."

@@ -16,7 +16,7 @@ from alpasim_plugin.core.geometry import yaw_from_quat
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, Trajectory
 from alpasim_plugin.log.run_folder.records import Contact
-from alpasim_plugin.log.run_folder.rows import Rollout, series_by_cell
+from alpasim_plugin.log.run_folder.rows import Rollout, series_by_rollout
 from evaluators.pages.birdseye import chord_angle, drawn_map
 from evaluators.pages.images import Rows, seen_before
 from evaluators.pages.rollouts import SERIES, events_of
@@ -237,7 +237,7 @@ def moments(
         steps.filter(pc.is_in(steps["metric"], pa.array(SERIES))) if steps.num_rows else steps
     )
     event_rows = []
-    for event in events_of(rollout, series_by_cell(event_steps)):
+    for event in events_of(rollout, series_by_rollout(event_steps)):
         text = event.what
         t_ms = None
         if event.t_us is not None and event.t_s is not None:

@@ -2,15 +2,28 @@
 sentence, that name no cause.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import heading_of, interpolate, inverse, rectangle_corners, speeds
-from alpasim_plugin.core.types import F64, Actor, Box, LoggedPlan, RolloutLog, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    STANDING_ID,
+    Actor,
+    Box,
+    LoggedPlan,
+    RolloutLog,
+    Trajectory,
+)
+from alpasim_plugin.log.run_folder.records import Contact, DriveEvent
 from evaluators.metrics.footprint import Geometries
+from evaluators.metrics.outcomes import outcome_of
+from evaluators.metrics.score import handover_us
+from evaluators.metrics.states import KINDS
 
+CONTACT_OUTCOMES = ("collision_any", "collision_at_fault")
 BEFORE_US = 6_000_000  # of the failure
 STEP_US = 100_000
 AWAY_M = 1.0  # from the route that the policy received
@@ -18,7 +31,48 @@ STANDS_M = 0.5
 BRAKES = 0.9  # share of the ego's speed below which a plan brakes
 
 
-def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: str) -> list[str]:
+def contact_of_failure(
+    log: RolloutLog, failure: DriveEvent, contacts: Iterable[Contact]
+) -> Contact | None:
+    """Return the contact that a rollout failed with: the first that began after the policy took
+    over and within the step of the failure; None where it failed with something else.
+
+    Args:
+        log: The log, up to the failure at least.
+        failure: The event with which it failed.
+        contacts: Beginnings of contacts of the whole log.
+    """
+    if outcome_of(failure) not in CONTACT_OUTCOMES:
+        return None
+    step = int(np.searchsorted(log.ego.t_us, failure.t_us))
+    begin_us = max(int(log.ego.t_us[max(step - 1, 0)]), handover_us(log))
+    in_step = [
+        contact
+        for contact in contacts
+        if begin_us <= contact_us(log, contact) <= failure.t_us and contact.actor_id in log.actors
+    ]
+    return min(in_step, key=lambda contact: contact.t_s, default=None)
+
+
+def contact_us(log: RolloutLog, contact: Contact) -> int:
+    """Return when a contact begins, microseconds, as in the log."""
+    return int(log.ego.t_us[0]) + round(contact.t_s * 1e6)
+
+
+def words_of(actor: Actor, contact: Contact) -> str:
+    """Say what kind of road user was touched, where it is seen from the ego, and its id."""
+    kind = actor.label if actor.label in KINDS else "road user"
+    if actor.actor_id.startswith(STANDING_ID):
+        kind = "standing obstacle"
+    place = {"front": "ahead", "rear": "behind"}.get(contact.side)
+    if place is None:
+        place = "on the left" if contact.y_m > 0.0 else "on the right"
+    return f"the {kind} {place} (`{actor.actor_id}`)"
+
+
+def plan_facts(
+    log: RolloutLog, failed_us: int, outcomes: frozenset[str], contact: Contact | None
+) -> list[str]:
     """Return what the plans before a failure, or before an end short of the path's, were: the most
     telling first.
 
@@ -26,8 +80,11 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
         log: The log, up to the failure at least.
         failed_us: When it failed, or ended.
         outcomes: Names of its outcomes; none of a drive that ended short.
-        met: The road user of a collision; empty where there is none.
+        contact: What it failed with, as `contact_of_failure` gives it; None where that is no
+            contact.
     """
+    if contact is not None:
+        failed_us = contact_us(log, contact)
     plans = [
         plan
         for plan in log.plans
@@ -35,10 +92,11 @@ def plan_facts(log: RolloutLog, failed_us: int, outcomes: frozenset[str], met: s
     ]
     if not plans:
         return []
-    if met in log.actors:
-        actor = log.actors[met]
+    if contact is not None:
+        actor = log.actors[contact.actor_id]
         leads = [_leads_into(log, plan.trajectory, actor) for plan in plans]
-        facts = _since(plans, leads, failed_us, f"before the failure leads into {actor.actor_id}")
+        property_text = f"before the failure leads into {words_of(actor, contact)}"
+        facts = _since(plans, leads, failed_us, property_text)
         driven = speeds(log.ego)
         for plan in plans:
             speed = float(np.interp(plan.now_us, log.ego.t_us, driven))

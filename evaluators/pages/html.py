@@ -18,14 +18,14 @@ from jinja2 import (
     PackageLoader,
     StrictUndefined,
 )
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.records import Project, json_of
-from alpasim_plugin.log.run_folder.rows import Series, series_by_cell
+from alpasim_plugin.log.run_folder.rows import Series, series_by_rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
 from evaluators.metrics.outcomes import has_ended, outcomes_of
 from evaluators.pages import tables
@@ -105,6 +105,7 @@ def environment_of(*packages: str) -> Environment:
     environment.globals.update(plural=plural, short=short, dash=DASH)
     environment.filters.update(
         beyond=lambda items, n: max(len(items) - n, 0),
+        coded=coded,
         degrees=lambda radians: f"{math.degrees(radians):.1f}",
         listed_counts=listed_counts,
         percent=lambda share, places: f"{fixed(100 * share, places)} %",
@@ -113,6 +114,20 @@ def environment_of(*packages: str) -> Environment:
         total=lambda counts: sum(counts.values()),
     )
     return environment
+
+
+def coded(text: str) -> Markup:
+    """Return a sentence with what stands between backticks as code.
+
+    Example:
+        >>> coded("into the car ahead (`lead`)")
+        Markup('into the car ahead (<code>lead</code>)')
+    """
+    words = [escape(part) for part in text.split("`")]
+    if len(words) % 2 == 0:
+        return escape(text)
+    words[1::2] = [Markup("<code>{}</code>").format(word) for word in words[1::2]]
+    return Markup("").join(words)
 
 
 def asset(environment: Environment, name: str) -> str:
@@ -127,7 +142,7 @@ def context(run: Run) -> dict[str, Any]:
     interesting = by_interest(run)
     variant_of = colours_of(run)
     looked_at = interesting[: 2 * MAX_SCENE_PLOTS]
-    series = series_by_cell(run.steps(SERIES, looked_at)) if looked_at else {}
+    series = series_by_rollout(run.steps(SERIES, looked_at)) if looked_at else {}
     views, no_view = scene_views(run, series, looked_at, variant_of)
     rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
     pairs = tables.pair_rows(run.summary.differences, run.table)

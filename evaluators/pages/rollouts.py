@@ -10,8 +10,8 @@ import base64
 import gzip
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import quote
 
@@ -37,6 +37,11 @@ COLLISION = (
     "collision_rear",
 )
 SIDES = {"collision_front": "front", "collision_lateral": "side", "collision_rear": "rear"}
+# outcome -> the metric that shows its contact, and those by side where no step has it
+CONTACTS = {
+    "collision_at_fault": ("collision_at_fault", "collision_front", "collision_lateral"),
+    "collision_any": ("collision_any", *SIDES),
+}
 OTHERS = tuple(
     name for name in OUTCOMES if name != POLICY_FAULT and not name.startswith("collision")
 )
@@ -99,30 +104,40 @@ def events_of(rollout: Rollout, series: Series) -> list[Event]:
     Steps that do not count (``eval_relevant`` 0, during warm-up) are passed over, so that the time
     shown is that of the event counted.
     """
-    cell_series = series.get(rollout.cell, {})
-    collisions = []
-    if rollout.flag(*COLLISION):
-        collisions.append(
-            _event("collision", rollout, cell_series, [m for m in COLLISION if rollout.flag(m)])
-        )
-    outcome_names = {one.name for one in told(outcomes_of(rollout))}
+    cell_series = series.get(rollout.key, {})
+    names = {outcome.name for outcome in told(outcomes_of(rollout))}
+    contacts = [name for name in CONTACTS if name in names]
     return [
-        *collisions,
-        *(_event(name, rollout, cell_series, [name]) for name in OTHERS if name in outcome_names),
+        *(_collision(rollout, cell_series, CONTACTS[name]) for name in contacts),
+        *(_event(name, rollout, cell_series, [name]) for name in OTHERS if name in names),
     ]
 
 
-def _event(kind: str, rollout: Rollout, cell_series: CellSeries, metrics: list[str]) -> Event:
-    firsts = {m: t for m in metrics if (t := _first(cell_series, m)) is not None}
-    side = next((SIDES[m] for m in metrics if m in SIDES), "")
+def _collision(rollout: Rollout, cell_series: CellSeries, metrics: Sequence[str]) -> Event:
+    """Return the contact that made an outcome, with the side that it touched at that instant. Where
+    no step shows it, the side is named only if the ego was touched at no other.
+    """
+    event = _event("collision", rollout, cell_series, metrics[:1])
+    if event.t_us is None:
+        event = _event("collision", rollout, cell_series, metrics[1:])
+    sides = [name for name in SIDES if rollout.flag(name)]
+    if event.t_us is not None:
+        sides = [name for name in sides if _is_on(cell_series, name, event.t_us)]
+    elif len(sides) > 1:
+        sides = []
+    return replace(event, side=SIDES[sides[0]] if sides else "")
+
+
+def _event(kind: str, rollout: Rollout, cell_series: CellSeries, metrics: Sequence[str]) -> Event:
+    firsts = [t for metric in metrics if (t := _first(cell_series, metric)) is not None]
     if not firsts:
-        return Event(kind, rollout, side=side)
-    t_us = min(firsts.values())
+        return Event(kind, rollout)
+    t_us = min(firsts)
     zero_us = min(int(t[0]) for t, _ in cell_series.values())
     x_m, y_m, yaw_rad = (
         _at(cell_series, name, t_us) for name in ("ego_x_m", "ego_y_m", "ego_yaw_rad")
     )
-    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, side, t_us)
+    return Event(kind, rollout, (t_us - zero_us) * 1e-6, x_m, y_m, yaw_rad, t_us=t_us)
 
 
 def _first(cell_series: CellSeries, metric: str) -> int | None:
@@ -134,6 +149,11 @@ def _first(cell_series: CellSeries, metric: str) -> int | None:
         relevant_t, relevant = cell_series["eval_relevant"]
         hit &= np.isin(t_us, relevant_t[relevant >= 0.5])
     return int(t_us[int(np.argmax(hit))]) if hit.any() else None
+
+
+def _is_on(cell_series: CellSeries, metric: str, t_us: int) -> bool:
+    times, values = cell_series.get(metric, (np.zeros(0, np.int64), np.zeros(0)))
+    return bool((values[times == t_us] >= 0.5).any())
 
 
 def _at(cell_series: CellSeries, name: str, t_us: int) -> float | None:

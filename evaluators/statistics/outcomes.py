@@ -8,34 +8,30 @@ import numpy as np
 from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import (
-    CONTACT_SIDES,
     ENDINGS,
     OUTCOMES,
     ending_of,
     has_ended,
+    outcome_events,
     outcomes_of,
     reached_end,
     told,
 )
 from evaluators.results import Endings, EventCount, EventPlace
 
-Times = Mapping[
-    tuple[str, str, str, int], Mapping[str, float]
-]  # rollout -> outcome -> seconds after the first frame
+Times = Mapping[str, Mapping[str, float]]  # rollout's folder -> outcome -> seconds after frame 0
 LISTED = 20  # rollouts named per outcome in summary.json
 DISTANCE = "lateral_distance_m"
 
 
 def times_of(manifests: Iterable[Manifest]) -> Times:
-    """Return when the outcomes of manifests began."""
-    times: dict[tuple[str, str, str, int], Mapping[str, float]] = {}
-    for manifest in manifests:
-        began = {event.metric: event.t_s for event in manifest.events}
-        contact = [began[side] for side in CONTACT_SIDES if side in began]
-        if contact:
-            began |= dict.fromkeys(("collision_any", "collision_at_fault"), min(contact))
-        times.setdefault(manifest.cell, began)
-    return times
+    """Return when the outcomes of manifests began, by the folders of their rollouts: several logs
+    may have one cell.
+    """
+    return {
+        manifest.path: {name: event.t_s for name, event in outcome_events(manifest.events).items()}
+        for manifest in manifests
+    }
 
 
 def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, Endings]:
@@ -60,7 +56,7 @@ def _of_variant(rollouts: Sequence[Rollout], times: Times) -> Endings:
     counts = Counter(map(ending_of, rollouts))
     places: dict[str, list[EventPlace]] = {}
     for rollout in ended:
-        began = times.get(rollout.cell, {})
+        began = times.get(rollout.path, {})
         for outcome in told(outcomes_of(rollout)):
             place = EventPlace(rollout.scene, rollout.seed, began.get(outcome.name))
             places.setdefault(outcome.name, []).append(place)

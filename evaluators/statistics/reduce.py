@@ -21,12 +21,14 @@ from evaluators.metrics.presets import DEFAULT, Preset
 from evaluators.metrics.presets import preset as find_preset
 
 EVENTS = (
+    "collision_at_fault",
     "collision_front",
     "collision_lateral",
     "collision_rear",
     "offroad",
     "wrong_lane",
     "left_route",
+    "ended_in_danger",
     "stalled",
     "braked_without_cause",
     "hard_brake",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import Signal
+from alpasim_plugin.core.types import Box, Signal
 from alpasim_plugin.runs.scoring import _placed as placed_events
 from evaluators import reduce_rollout, score
 from evaluators.metrics.motion import safe_distance_m
@@ -34,6 +34,32 @@ def test_time_to_collision_and_impact_speed_of_a_drive_into_a_standing_car():
     impact = found["impact_speed_mps"]
     assert impact.valid.sum() == 1
     assert impact.value[impact.valid] == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("preset", ["strict", "paper"])
+def test_a_contact_between_steps_has_an_impact_speed_where_it_counts(preset):
+    """A car crosses at 60 m/s: its box is before the ego at one step and past it at the next."""
+    t = np.arange(N) * 0.1
+    crossing = car("crosses", track(40.0, 60.0 * (t - 4.75), yaw=np.pi / 2), Box(1.5, 1.8, 1.5))
+    found = scored(rollout(track(CRUISE, 0.0), [crossing]), preset=preset)
+    is_hit = found["collision_any"].value > 0
+    impact = found["impact_speed_mps"]
+    assert impact.valid.tolist() == is_hit.tolist()
+    assert is_hit.sum() == (preset == "strict")
+    if preset == "strict":
+        assert impact.value[is_hit] == pytest.approx(np.hypot(8.0, 60.0))
+
+
+def test_a_contact_of_the_warm_up_has_no_impact_speed_and_says_so():
+    stands = car("stands", track(np.full(N, 12.0), 0.0))
+    log = rollout(track(CRUISE, 0.0), [stands], warmup_us=1_200_000)
+    impact = scored(log)["impact_speed_mps"]
+    assert not impact.valid.any()
+    assert "no contact begins" in impact.reason
+    once = car("once", track(12.0, 0.0, t_us=[950_000]))
+    impact = scored(rollout(track(CRUISE, 0.0), [once]))["impact_speed_mps"]
+    assert not impact.valid.any()
+    assert "velocity is not known" in impact.reason
 
 
 def test_who_crosses_at_speed_is_seen_from_the_side_however_far_off_the_nose():

@@ -9,8 +9,11 @@ import scipy.signal
 import shapely
 
 from evaluators.metrics import nuplan
-from evaluators.metrics.states import EgoStates, Tracks, savitzky_golay
+from evaluators.metrics.presets import PRESETS
+from evaluators.metrics.scored import ScoredRollout
+from evaluators.metrics.states import EgoStates, Tracks, savitzky_golay, states_of
 from tests.data_sets import shared_folder
+from tests.evaluators.eval_build import TWO_LANES, VEHICLE, rollout, scene, scored, track
 
 FIXTURES = shared_folder() / "nuplan-devkit-fixtures"
 OF_PLANS = (
@@ -34,7 +37,8 @@ def states(rows):
     )
     t_us = np.array([row["time_us"] for row in rows])
     size = (FRONT_M + REAR_M, WIDTH_M)
-    return EgoStates(t_us, pose[:, :2], pose[:, 2], velocity, accel, size, (FRONT_M - REAR_M) / 2)
+    ahead_m = (FRONT_M - REAR_M) / 2
+    return EgoStates(t_us, pose[:, :2], pose[:, 2], velocity, accel, accel, size, ahead_m)
 
 
 def tracks(worlds):
@@ -149,6 +153,7 @@ def test_when_boxes_touch_is_what_a_search_in_small_steps_finds():
         rng.uniform(-4, 4, n),
         np.column_stack([rng.uniform(0, 12, n), np.zeros(n)]),
         np.zeros((n, 2)),
+        np.zeros((n, 2)),
         (5.0, 2.0),
         1.4,
     )
@@ -185,14 +190,53 @@ def test_the_filter_is_scipys(window, order, times, longer):
     np.testing.assert_allclose(savitzky_golay(values, window, order, times), want, atol=1e-12)
 
 
+def slalom(rate, period_s):
+    """Return a log whose rear axle drives 12 m/s, with a yaw rate that swings up to ``rate``."""
+    t = 0.1 * np.arange(120)
+    pulse = 2 * np.pi / period_s
+    fine = np.arange(0.0, t[-1] + 0.1, 1e-3)
+    yaw_fine = rate / pulse * (1 - np.cos(pulse * fine))
+    xy_fine = 12.0 * np.cumsum(np.column_stack([np.cos(yaw_fine), np.sin(yaw_fine)]), axis=0) * 1e-3
+    yaw = np.interp(t, fine, yaw_fine)
+    rear = np.column_stack([np.interp(t, fine, column) for column in xy_fine.T])
+    ahead_m = VEHICLE.rear_axle_to_centre_m
+    centre = rear + ahead_m * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    turning = rate * np.sin(pulse * t)
+    swing = ahead_m * np.column_stack([-(turning**2), rate * pulse * np.cos(pulse * t)])
+    return rollout(track(*centre.T, yaw)), np.column_stack([0 * t, 12.0 * turning]) + swing
+
+
+def test_the_acceleration_of_the_centre_holds_what_turning_adds():
+    log, wanted = slalom(0.4, 4.0)
+    ego, _ = states_of(log, PRESETS["nuplan"], log.ego, np.zeros(3))
+    assert np.abs(ego.centre_accel - wanted)[3:-3].max() < 0.1
+    assert np.abs(ego.accel - wanted)[3:-3, 1].max() > 0.8
+
+
+def test_comfort_is_nuplans_at_the_centre_and_navsims_at_the_rear_axle():
+    """Only at the centre the sideways acceleration is beyond 4.89 m/s2."""
+    log, _ = slalom(0.408, 5.0)
+    drive = ScoredRollout(log, scene(TWO_LANES, log), PRESETS["nuplan"], log.ego)
+    peaks = [
+        np.abs(nuplan.motion(drive.ego, place)["lat_accel"]).max()
+        for place in ("rear_axle", "centre")
+    ]
+    bound = nuplan.COMFORT["lat_accel"][1]
+    assert peaks[0] < bound < peaks[1]
+    assert (drive.comfort("rear_axle"), drive.comfort("centre")) == (1.0, 0.0)
+    protocols = {"nuplan": ("nuplan_comfort", 0.0), "navsim": ("navsim_hc", 1.0)}
+    for preset, (metric, wanted) in protocols.items():
+        assert scored(log, preset=preset)[metric].value[-1] == wanted
+
+
 def test_a_collision_is_the_first_contact_with_each_road_user_in_order_of_time():
     n = 30
     x = np.arange(n, dtype=float)
     still = np.zeros((n, 2))
     velocity = np.column_stack([np.full(n, 10.0), np.zeros(n)])
-    ego = EgoStates(
-        100_000 * np.arange(n), np.column_stack([x, 0 * x]), 0 * x, velocity, still, (5.0, 2.0), 1.5
-    )
+    t_us = 100_000 * np.arange(n)
+    rear_xy = np.column_stack([x, 0 * x])
+    ego = EgoStates(t_us, rear_xy, 0 * x, velocity, still, still, (5.0, 2.0), 1.5)
     places = [(20.0, "object"), (10.0, "object"), (15.0, "vehicle")]
     users = Tracks(
         ids=("far", "near", "middle"),

@@ -11,11 +11,14 @@ from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_y
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
 from alpasim_plugin.log.run_folder.rows import Rollout, rollouts_of_table
 from alpasim_plugin.log.run_folder.writer import rollout_table
+from alpasim_plugin.runs.scoring import tabulate
 from evaluators import reduce_rollout, score
 from evaluators.metrics.outcomes import (
     OUTCOMES,
     evaluate_outcomes,
+    first_failure,
     in_words,
+    outcome_events,
     outcomes_of,
 )
 from evaluators.metrics.presets import PRESETS
@@ -195,7 +198,7 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
             "scene": scene,
             "seed": 0,
             "status": "ok",
-            "path": "",
+            "path": f"rollouts/clean/{policy}/{scene}/0",
             "wall_s": 1.0,
             "metrics": metrics,
             "events": events,
@@ -223,6 +226,38 @@ def test_outcomes_are_counted_by_arm_with_place_and_time():
         table["clean/b"].n_ended,
         table["clean/b"].n_failed,
     ) == (3, 2, 2)
+
+
+def test_two_logs_of_one_cell_have_times_of_their_own():
+    offroad = {"offroad": {"value": 1.0, "valid": True, "reason": ""}}
+    manifests = [
+        run_records.manifest(
+            {
+                "path": f"rollouts/clean/p/s/{name}",
+                "rollout": name,
+                "metrics": offroad,
+                "events": [{"metric": "offroad", "t_s": t_s}],
+            }
+        )
+        for name, t_s in (("log 1", 2.0), ("log 2", 5.0))
+    ]
+    rollouts = rollouts_of_table(rollout_table(manifests))
+    assert [rollout.key[-1] for rollout in rollouts] == ["log 1", "log 2"]
+    (endings,) = outcome_table(rollouts, times_of(manifests)).values()
+    assert [cell.t_s for cell in endings.outcomes["offroad"].cells] == [2.0, 5.0]
+
+
+def test_where_a_preset_drives_on_the_fault_has_the_time_of_its_own_contact():
+    """Who follows runs into the ego at 2 s; the ego runs into what stands at 5 s."""
+    follower = track(np.concatenate([-12.6 + 12.0 * np.arange(21) * DT_S, np.full(99, 11.4)]))
+    log, scene = drive(
+        track(V * T), actors={"follows": follower, "stands": track(np.full(len(T), 44.6))}
+    )
+    _, scores = tabulate(log, score(log, scene, "nuplan"), "nuplan")
+    began = outcome_events(scores.events)
+    assert began["collision_any"].metric == "collision_rear"
+    assert (began["collision_any"].t_s, began["collision_at_fault"].t_s) == (2.0, 5.0)
+    assert first_failure(scores.events) == began["collision_at_fault"]
 
 
 def test_presets_that_reproduce_alpasim_get_no_metric_that_it_does_not_have():

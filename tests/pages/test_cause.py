@@ -1,6 +1,7 @@
 """Which plans the page of a failure shows."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,8 +10,13 @@ import pytest
 
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.types import LoggedPlan, Trajectory
+from alpasim_plugin.log.run_folder.records import Contact, DriveEvent
+from alpasim_plugin.runs.scoring import tabulate
+from evaluators import score
+from evaluators.metrics.outcomes import first_failure
 from evaluators.pages.cause import AFTER_US, BEFORE_US, MOST_QUERIES, commands, shown_plans
-from evaluators.pages.evidence import asked_mps
+from evaluators.pages.evidence import asked_mps, contact_of_failure, plan_facts, words_of
+from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
 
 STEP_US = 50_000
 
@@ -60,3 +66,78 @@ def test_a_fork_without_a_parting_begins_before_the_failure_and_quotes_its_rende
     assert "--at 2.0 --renderer 3dgs" in commands(run, cause)[0][2]
     cause.partings = [parting]
     assert shlex.split(commands(run, cause)[0][2])[-1] == parting.name
+
+
+def straight_plans(log):
+    """Return a plan each half second: straight on at 8 m/s, in the rig's place."""
+    t_us = 100_000 * np.arange(31)
+    rear_m = float(log.T_rig_box[0, 3])
+    plans = []
+    for now_us in range(0, int(log.ego.t_us[-1]), 500_000):
+        x = 8e-6 * (now_us + t_us) - rear_m
+        xyz = np.column_stack([x, 0 * x, 0 * x])
+        poses = Trajectory(now_us + t_us, xyz, quat_from_yaw(np.zeros(len(t_us))))
+        route = np.column_stack([np.arange(0.0, 60.0), np.zeros(60)])
+        plans.append(LoggedPlan(now_us, now_us, poses, route=route))
+    return tuple(plans)
+
+
+def drive_into(x_m, warmup_us=0, **more):
+    """Return a drive at 8 m/s along x into what stands with its middle at ``x_m``, its first
+    failure, and its contacts.
+    """
+    log = rollout(
+        track(8.0 * 0.1 * np.arange(80), 0.0),
+        [car("stands", track(np.full(80, x_m), 0.0)), *more.values()],
+        warmup_us=warmup_us,
+    )
+    log = replace(log, plans=straight_plans(log))
+    _, scores = tabulate(log, score(log, scene(TWO_LANES, log), "strict"), "strict")
+    return log, first_failure(scores.events), scores.contacts
+
+
+def test_a_contact_after_the_failure_is_not_what_it_failed_with():
+    log, failure, contacts = drive_into(40.0)
+    assert contact_of_failure(log, failure, contacts).actor_id == "stands"
+    offroad = DriveEvent("offroad", 3_000_000, 3.0, 24.0, 0.0)
+    assert contacts[0].t_s > offroad.t_s
+    assert contact_of_failure(log, offroad, contacts) is None
+    sentences = plan_facts(log, offroad.t_us, frozenset({"offroad"}), None)
+    assert not any("leads into" in text or "brakes" in text for text in sentences)
+
+
+def test_a_contact_of_the_warm_up_is_not_what_it_failed_with():
+    behind = car("pushes", track(np.full(80, -4.0), 0.0))
+    log, failure, contacts = drive_into(40.0, warmup_us=1_000_000, behind=behind)
+    assert [contact.actor_id for contact in contacts] == ["pushes", "stands"]
+    assert contact_of_failure(log, failure, contacts).actor_id == "stands"
+    early = replace(failure, t_us=1_000_000)
+    assert contact_of_failure(log, early, contacts) is None
+
+
+def test_evidence_about_a_contact_says_who_is_where_and_counts_from_the_contact_itself():
+    log, failure, contacts = drive_into(40.0)
+    facts = plan_facts(
+        log,
+        failure.t_us,
+        frozenset({"collision_any"}),
+        contact_of_failure(log, failure, contacts),
+    )
+    assert facts[0].endswith("before the failure leads into the car ahead (`stands`).")
+    # touched at 4.42 s; the plan of 1.5 s is the first that reaches so far
+    assert facts[0].startswith("Every plan of the last 2.9 s")
+    assert facts[1].startswith("No plan brakes")
+
+
+def test_who_was_touched_is_named_by_kind_and_place():
+    actor = car("a", track([0.0], 0.0))
+    contact = Contact("a", 1.0, "lateral", 1.0, 0.9)
+    assert words_of(actor, contact) == "the car on the left (`a`)"
+    assert words_of(actor, replace(contact, y_m=-0.9)) == "the car on the right (`a`)"
+    assert words_of(replace(actor, label="pedestrian"), replace(contact, side="front")) == (
+        "the pedestrian ahead (`a`)"
+    )
+    other = replace(actor, label="other")
+    assert words_of(other, replace(contact, side="rear")) == "the road user behind (`a`)"
+    standing = replace(other, actor_id="obstacle-001-within-0.3m")
+    assert words_of(standing, replace(contact, side="front")).startswith("the standing obstacle")

@@ -1,5 +1,7 @@
 """The maps from above: what is drawn is where and when it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ def series_of(x, y, **more):
 
 
 def drawn(rollout, content, own):
-    return still_map("s", content, [rollout], {rollout.cell: own} if own else {}, VARIANTS)
+    return still_map("s", content, [rollout], {rollout.key: own} if own else {}, VARIANTS)
 
 
 def test_an_event_is_marked_where_and_when_it_happened():
@@ -62,10 +64,34 @@ def test_an_event_during_warm_up_does_not_give_the_time():
     off = [1.0] * 5 + [0.0] * 10 + [1.0] * 5
     relevant = [0.0] * 8 + [1.0] * 12
     series = {
-        rollout.cell: series_of(np.zeros(20), np.zeros(20), offroad=off, eval_relevant=relevant)
+        rollout.key: series_of(np.zeros(20), np.zeros(20), offroad=off, eval_relevant=relevant)
     }
     (event,) = events_of(rollout, series)
     assert event.t_s == pytest.approx(1.5)
+
+
+def test_a_collision_has_time_and_side_of_the_contact_that_made_the_outcome():
+    """Something touches the rear at 2 s; the ego drives into something at 5 s."""
+    hit_rear = [0.0] * 20 + [1.0] * 10 + [0.0] * 21
+    hit_front = [0.0] * 50 + [1.0]
+    names = ("collision_any", "collision_at_fault", "collision_front", "collision_rear")
+    rollout = Rollout("a", "p", "s", 0, "ok", metrics=dict.fromkeys(names, 1.0))
+    either = np.maximum(hit_rear, hit_front)
+    steps = series_of(
+        X,
+        0 * X,
+        collision_any=either,
+        collision_at_fault=hit_front,
+        collision_front=hit_front,
+        collision_rear=hit_rear,
+    )
+    (event,) = events_of(rollout, {rollout.key: steps})
+    assert (event.t_s, event.what) == (pytest.approx(5.0), "collision (front)")
+    innocent = replace(rollout, metrics=rollout.metrics | {"collision_at_fault": 0.0})
+    (event,) = events_of(innocent, {rollout.key: steps})
+    assert (event.t_s, event.what) == (pytest.approx(2.0), "collision (rear)")
+    (event,) = events_of(rollout, {})
+    assert event.what == "collision"
 
 
 def test_a_lane_without_an_edge_gives_its_line_and_no_area():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.log.run_folder.rows import series_by_cell
+from alpasim_plugin.log.run_folder.rows import series_by_rollout
 from evaluators.statistics.opening import read_run
 
 
@@ -96,6 +96,7 @@ rows = st.lists(
             "policy": st.sampled_from(["p", "p/q"]),
             "scene": st.sampled_from(["s", "t", "s/t"]),
             "seed": st.sampled_from([0, 1, -3, 2**60]),
+            "rollout": st.sampled_from(["", "log 1", "log 2"]),
             "metric": st.sampled_from("mn"),
             "t_us": st.integers(-(10**15), 10**15),
             "value": st.floats(-1e9, 1e9),
@@ -108,6 +109,7 @@ rows = st.lists(
         row["policy"],
         row["scene"],
         row["seed"],
+        row["rollout"],
         row["metric"],
         row["t_us"],
     ),
@@ -120,15 +122,15 @@ def test_series_agree_with_a_plain_loop(made, coded):  # type: ignore[type-arg]
     slow = {}  # type: ignore[type-arg]
     for row in sorted(made, key=lambda r: r["t_us"]):
         if row["valid"]:
-            cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
+            cell = tuple(row[name] for name in ("renderer", "policy", "scene", "seed", "rollout"))
             slow.setdefault(cell, {}).setdefault(row["metric"], []).append(
                 (row["t_us"], row["value"])
             )
-    names = ["renderer", "policy", "scene", "seed", "metric", "t_us", "value", "valid"]
-    types = [pa.string()] * 3 + [pa.int64(), pa.string(), pa.int64(), pa.float64(), pa.bool_()]
+    names = ["renderer", "policy", "scene", "rollout", "metric", "seed", "t_us", "value", "valid"]
+    types = [pa.string()] * 5 + [pa.int64(), pa.int64(), pa.float64(), pa.bool_()]
     table = pa.Table.from_pylist(made, schema=pa.schema(list(zip(names, types, strict=True))))
     if coded:
-        for name in ("renderer", "policy", "scene", "metric"):
+        for name in ("renderer", "policy", "scene", "rollout", "metric"):
             table = table.set_column(
                 table.column_names.index(name), name, table[name].dictionary_encode()
             )
@@ -137,6 +139,6 @@ def test_series_agree_with_a_plain_loop(made, coded):  # type: ignore[type-arg]
             metric: list(zip(t.tolist(), v.tolist(), strict=True))
             for metric, (t, v) in series.items()
         }
-        for cell, series in series_by_cell(table).items()
+        for cell, series in series_by_rollout(table).items()
     }
     assert fast == slow

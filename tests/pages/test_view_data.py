@@ -16,7 +16,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Vehicle
 from alpasim_plugin.log import read_asl, read_facts, write_facts, write_mp4
-from alpasim_plugin.log.run_folder.rows import series_by_cell
+from alpasim_plugin.log.run_folder.rows import series_by_rollout
 from evaluators.pages.cells import (
     Wanted,
     cell_data,
@@ -119,7 +119,7 @@ def test_events_are_at_the_times_that_the_report_states(watched_run):
     seen = 0
     for cell in cells_of(run):
         data = cell_data(run, cell, read_logs(run, cell))
-        series = series_by_cell(run.steps(SERIES, [cell.scene]))
+        series = series_by_rollout(run.steps(SERIES, [cell.scene]))
         for rollout, drive in zip(cell.rollouts, data["drives"], strict=True):
             stated = [
                 (event.kind, round(event.t_s * 1000))

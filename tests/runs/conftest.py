@@ -25,7 +25,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.run_folder.rows import series_by_cell
+from alpasim_plugin.log.run_folder.rows import series_by_rollout
 from alpasim_plugin.world.ground import flat
 from evaluators.statistics.opening import Run, read_run
 from tests.camera_builders import ahead
@@ -142,7 +142,7 @@ class Watched:
 
     def metrics(self, renderer):
         (rollout,) = (r for r in self.run.rollouts if (r.renderer, r.seed) == (renderer, 0))
-        (own,) = series_by_cell(self.run.steps_of(rollout)).values()
+        (own,) = series_by_rollout(self.run.steps_of(rollout)).values()
         return {
             name: list(zip(t.tolist(), v.tolist(), strict=True)) for name, (t, v) in own.items()
         }

@@ -229,7 +229,7 @@ FAULTS = {
     },
     "hard/hard_brake": {
         BlindToCars: "images changed no plan",
-        BrakesLate: "leads into leader",
+        BrakesLate: "leads into the car ahead (`leader`)",
     },
     "smoke/curve": {
         MirroredImages: "read mirrored",

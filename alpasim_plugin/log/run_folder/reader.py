@@ -7,7 +7,8 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import and_
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Self
@@ -34,6 +35,7 @@ from alpasim_plugin.log.run_folder.rows import Rollout, StoredRollouts, rollouts
 from alpasim_plugin.log.run_folder.schema import (
     AGAIN,
     KEYS,
+    LOG_COLUMN,
     MANIFEST,
     ROLLOUTS,
     ROLLOUTS_TABLE,
@@ -48,8 +50,10 @@ from alpasim_plugin.log.run_folder.shapes import SceneFile
 from alpasim_plugin.log.run_folder.writer import rollout_table
 
 TRACEBACK_LINES = 3
-STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid")
-TEXT_AS_CODES = pads.ParquetFileFormat(dictionary_columns={"renderer", "policy", "scene", "metric"})
+STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid", LOG_COLUMN.name)
+TEXT_AS_CODES = pads.ParquetFileFormat(
+    dictionary_columns={"renderer", "policy", "scene", "metric", LOG_COLUMN.name}
+)
 
 REMADE: dict[Path, TemporaryDirectory[str]] = {}  # run folder -> tables that were made again
 
@@ -198,8 +202,8 @@ class Run:
         """Read the named series from ``steps.parquet``.
 
         Returns:
-            A table with renderer, policy, scene, seed, t_us, metric, value and valid; empty without
-            the file.
+            A table with renderer, policy, scene, seed, t_us, metric, value and valid, of scored
+            logs rollout too; empty without the file.
         """
         keep = pc.field("metric").isin(list(metrics))
         if scenes is not None:
@@ -210,13 +214,15 @@ class Run:
         """Read all series of one rollout, from the table in its own folder or else from the run's.
 
         Returns:
-            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason; empty
-            where neither exists.
+            A table with renderer, policy, scene, seed, t_us, metric, value, valid and reason, of a
+            scored log rollout too; empty where neither exists.
         """
         rollout_file = self.file_of(rollout, STEPS_NAME)
         keep = None
-        for name, value in zip(KEYS, rollout.cell, strict=True) if rollout_file is None else ():
-            keep = pc.field(name) == value if keep is None else keep & (pc.field(name) == value)
+        if rollout_file is None:
+            wanted = dict(zip(KEYS, rollout.cell, strict=True))
+            wanted |= {LOG_COLUMN.name: rollout.log} if rollout.log else {}
+            keep = reduce(and_, (pc.field(name) == value for name, value in wanted.items()))
         return self._read_steps(
             rollout_file or table_path(self.folder, STEPS), (*STEP_COLUMNS, "reason"), keep
         )
@@ -225,14 +231,16 @@ class Run:
         self, path: Path, columns: Sequence[str], keep: pc.Expression | None, coded: bool = True
     ) -> pa.Table:
         if not os.path.isfile(path):
-            return STEPS_TABLE.arrow().empty_table().select(list(columns))
+            names = [name for name in columns if name != LOG_COLUMN.name]
+            return STEPS_TABLE.arrow().empty_table().select(names)
         if path not in self._steps_checked:
             STEPS_TABLE.check(path)
             self._steps_checked.add(path)
         with parsing(path, AGAIN, "no readable parquet"):
-            return pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet").to_table(
-                columns=list(columns), filter=keep
-            )
+            rows = pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet")
+            of_logs = LOG_COLUMN.name in rows.schema.names
+            names = [name for name in columns if of_logs or name != LOG_COLUMN.name]
+            return rows.to_table(columns=names, filter=keep)
 
     @cached_property
     def _steps_checked(self) -> set[Path]:

@@ -12,7 +12,17 @@ import pyarrow.compute as pc
 
 from alpasim_plugin.core.types import F64, I64
 from alpasim_plugin.log.run_folder.records import CellStatus
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, cell_name, metrics_in
+from alpasim_plugin.log.run_folder.schema import (
+    KEYS,
+    LOG_COLUMN,
+    ROLLOUTS_TABLE,
+    VALID,
+    cell_name,
+    metrics_in,
+)
+
+# renderer, policy, scene, seed, and the name of a scored log
+RolloutKey = tuple[str, str, str, int, str]
 
 
 @dataclass(frozen=True)
@@ -25,6 +35,7 @@ class Rollout(CellStatus):
         metrics: Rollout values; None where the metric is invalid or was not computed.
         path: Folder of the rollout relative to the run folder, POSIX separators.
         copied_from: That of the rollout that it is a copy of; empty for a rollout that was driven.
+        log: Of a scored log: its name, by which several logs of one cell differ.
     """
 
     failure_class: str = ""
@@ -34,7 +45,13 @@ class Rollout(CellStatus):
     wall_s: float | None = None
     frames: int | None = None
     steps: int | None = None
+    log: str = ""
     metrics: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def key(self) -> RolloutKey:
+        """Give what names it among all rollouts of a run, repeats of its cell too."""
+        return (*self.cell, self.log)
 
     def flag(self, *names: str) -> bool:
         """Return whether any of the named 0/1 metrics is 1."""
@@ -82,8 +99,8 @@ def rollouts_of_table(table: pa.Table) -> tuple[Rollout, ...]:
         facts |= {key: row.get(key) for key in ("frames", "steps")}
         facts |= {key: row.get(key) or "" for key in ("failure_class", "failure", "copied_from")}
         metrics = {name: _number(row[name]) if row[name + VALID] else None for name in names}
-        path = (row.get("path") or "").strip("/")
-        rows.append(Rollout(**facts, path=path, wall_s=_number(row.get("wall_s")), metrics=metrics))
+        facts |= {"path": (row.get("path") or "").strip("/"), "log": row.get(LOG_COLUMN.name) or ""}
+        rows.append(Rollout(**facts, wall_s=_number(row.get("wall_s")), metrics=metrics))
     return tuple(rows)
 
 
@@ -92,17 +109,18 @@ def _number(value: float | None) -> float | None:
 
 
 CellSeries = dict[str, tuple[I64, F64]]  # metric -> (t_us (T,), value (T,)) of one rollout
-Series = dict[tuple[str, str, str, int], CellSeries]
+Series = dict[RolloutKey, CellSeries]
 
 
-def series_by_cell(table: pa.Table) -> Series:
+def series_by_rollout(table: pa.Table) -> Series:
     """Split a step table into valid, finite, time-sorted series.
 
     Returns:
-        cell -> metric -> (``t_us (T,)``, ``value (T,)``).
+        `Rollout.key` -> metric -> (``t_us (T,)``, ``value (T,)``).
     """
     table = table.filter(pc.and_(table["valid"], pc.is_finite(table["value"])))
-    names = [*KEYS, "metric"]
+    of_logs = LOG_COLUMN.name in table.column_names
+    names = [*KEYS, *([LOG_COLUMN.name] if of_logs else []), "metric"]
     groups = (
         table.unify_dictionaries()
         .sort_by("t_us")
@@ -114,7 +132,8 @@ def series_by_cell(table: pa.Table) -> Series:
         groups.select(names).to_pylist(), groups["t_us_list"], groups["value_list"], strict=True
     )
     for row, t_us, value in rows:
-        cell = (row["renderer"], row["policy"], row["scene"], row["seed"])
-        cell_series = series.setdefault(cell, {})
+        log = row[LOG_COLUMN.name] if of_logs else ""
+        key = (row["renderer"], row["policy"], row["scene"], row["seed"], log)
+        cell_series = series.setdefault(key, {})
         cell_series[row["metric"]] = (t_us.values.to_numpy(), value.values.to_numpy())
     return series
