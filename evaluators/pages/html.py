@@ -5,7 +5,7 @@ import hashlib
 import json
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -22,12 +22,12 @@ from markupsafe import Markup, escape
 
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.files.atomic import write_text
-from alpasim_plugin.core.json_types import JsonObject
+from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.reader import reporting
 from alpasim_plugin.log.run_folder.records import Project, json_of
 from alpasim_plugin.log.run_folder.rows import Series, series_by_rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
-from evaluators.metrics.outcomes import has_ended, outcomes_of
+from evaluators.metrics.outcomes import OUTCOMES, has_ended, outcomes_of
 from evaluators.pages import tables
 from evaluators.pages.above import still_map
 from evaluators.pages.boundary import boundary_section
@@ -36,7 +36,7 @@ from evaluators.pages.fixers import pool_text, refused
 from evaluators.pages.flips import colours_of, flip_bases, flip_rows
 from evaluators.pages.gate import gate_section
 from evaluators.pages.overview import TONES, overview_of
-from evaluators.pages.rollouts import SERIES, rollout_block
+from evaluators.pages.rollouts import OTHERS, SERIES, rollout_block
 from evaluators.pages.worst import worst_change
 from evaluators.statistics.numbers import DASH, fixed, listed_counts, percents, plural, short
 from evaluators.statistics.opening import Run, read_run
@@ -182,6 +182,7 @@ def context(run: Run) -> dict[str, Any]:
         "dashed": len(run.policies) > 1 and not by_policy,
         "policies": run.policies,
         "views": views,
+        "marked": marked_events(views),
         "open_views": OPEN_SCENE_PLOTS,
         "views_left_out": no_view,
         "refused": refused,
@@ -225,6 +226,15 @@ def by_interest(run: Run) -> list[str]:
         return events, max(far, default=0.0)
 
     return sorted(run.by_scene, key=interest, reverse=True)
+
+
+def marked_events(views: Sequence[JsonView]) -> list[str]:
+    """Name the events that maps mark, in the order of the outcomes: collisions with a round sign,
+    others with a square one.
+    """
+    kinds = {mark["kind"] for view in views for mark in view["marks"]}
+    words = {"collision": "collision"} | {name: OUTCOMES[name].words for name in OTHERS}
+    return [words[kind] for kind in words if kind in kinds]
 
 
 def scene_views(

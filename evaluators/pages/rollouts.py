@@ -20,8 +20,11 @@ import numpy as np
 from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, Series
 from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
 from evaluators.metrics.outcomes import (
+    ENDINGS,
+    NOT_RUN,
     OUTCOMES,
     POLICY_FAULT,
+    ending_of,
     has_ended,
     in_words,
     outcomes_of,
@@ -165,7 +168,9 @@ def _at(cell_series: CellSeries, name: str, t_us: int) -> float | None:
 
 MAX_ROLLOUTS = 200_000  # more make a page that browsers are slow with
 MAX_TEXT = 300  # letters of a note
-COLLIDED, OTHERWISE, FAILED, HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(6))
+HAS_FOLDER, HAS_CLIP, HAS_WHY = (1 << bit for bit in range(3))
+# Colours of what a row ended with; one without an event has none.
+BROKEN, COLLIDED, OTHERWISE = "failed", "collision", "offroad"
 
 
 @dataclass(frozen=True)
@@ -186,18 +191,24 @@ class RolloutBlock:
 def rollout_block(run: Run) -> RolloutBlock:
     """Pack the rollouts of a run: base64 of compressed JSON.
 
-    The document holds ``renderers``; ``texts``: NAME -> a text a rollout; ``state``: what each
-    ended with and which files it has, as bits; and ``numbers``: metrics with ``name``, ``unit``,
-    what they are, and ``data``, a number a rollout with four digits, null where it is missing.
+    The document holds ``coloured``: the column whose names have colours, and those names;
+    ``kinds``: the outcomes of the run, the gravest first, by name and words; ``texts``: NAME -> a
+    text a rollout; ``had``: which of the kinds each had, as bits; ``state``: which files it has, as
+    bits; and ``numbers``: metrics with ``name``, ``unit``, what they are, and ``data``, a number a
+    rollout with four digits, null where it is missing.
     """
     rollouts = run.rollouts[:MAX_ROLLOUTS]
+    had = [outcomes_of(rollout) for rollout in rollouts]
+    kinds = [name for name in OUTCOMES if any(name in names for names in had)]
     texts = {
         "scene": [r.scene for r in rollouts],
         "renderer": [r.renderer for r in rollouts],
         "policy": [r.policy for r in rollouts],
         "seed": [str(r.seed) for r in rollouts],
         "folder": [quote(r.path) for r in rollouts],
-        "outcome": [in_words(outcomes_of(r)) if has_ended(r) else "failed" for r in rollouts],
+        "outcome": [in_words(outcomes_of(r)) if has_ended(r) else NOT_RUN for r in rollouts],
+        "ending": [ending_of(r) for r in rollouts],
+        "tone": [_tone(r) for r in rollouts],
         "note": [_note(r)[:MAX_TEXT] for r in rollouts],
     }
     walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
@@ -214,9 +225,13 @@ def rollout_block(run: Run) -> RolloutBlock:
                 "data": [_short(r.metrics.get(metric)) for r in rollouts],
             }
         )
+    by_policy = len(run.renderers) == 1 and len(run.policies) > 1
     document = {
-        "renderers": run.renderers,
+        "coloured": ["policy", run.policies] if by_policy else ["renderer", run.renderers],
+        "kinds": [[name, OUTCOMES[name].words] for name in kinds],
+        "endings": [name for name in ENDINGS if name in texts["ending"]],
         "texts": texts,
+        "had": [sum(1 << kinds.index(name) for name in names) for names in had],
         "state": [_state(run, rollout) for rollout in rollouts],
         "numbers": numbers,
     }
@@ -237,14 +252,18 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.4g}")
 
 
-def _state(run: Run, rollout: Rollout) -> int:
-    """Return what a rollout ended with, and which files of it are there, as bits."""
+def _tone(rollout: Rollout) -> str:
+    """Return the colour of what a rollout ended with; empty without an event."""
     if not rollout.ok:
-        state = FAILED
-    elif rollout.flag(*COLLISION):
-        state = COLLIDED
-    else:
-        state = OTHERWISE if outcomes_of(rollout) else 0
+        return BROKEN
+    if rollout.flag(*COLLISION):
+        return COLLIDED
+    return OTHERWISE if outcomes_of(rollout) else ""
+
+
+def _state(run: Run, rollout: Rollout) -> int:
+    """Return which files of a rollout are there, as bits."""
+    state = 0
     folder = run.folder / rollout.path
     if rollout.path and os.path.isdir(folder):
         state |= HAS_FOLDER

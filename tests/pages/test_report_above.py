@@ -8,6 +8,7 @@ import pytest
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.writer import scene_as_json
 from evaluators.pages.above import still_map
+from evaluators.pages.html import marked_events
 from evaluators.pages.rollouts import events_of
 from scenarios.load import load_scenario
 
@@ -47,6 +48,18 @@ def test_an_event_that_no_step_shows_is_listed_without_a_place():
     (mark,) = drawn(rollout, scene([0.0, 50.0], [0.0, 0.0]), None)["marks"]
     assert "x" not in mark
     assert mark["text"] == "a \u00b7 seed 0: off-road at a time that no step shows"
+
+
+def test_the_legend_names_the_events_that_the_maps_mark():
+    stalled = drawn(
+        Rollout("a", "p", "s", 0, "ok", metrics={"stalled": 1.0}), scene(X, 0 * X), None
+    )
+    hit = drawn(
+        Rollout("a", "p", "s", 0, "ok", metrics={"collision_any": 1.0}), scene(X, 0 * X), None
+    )
+    assert marked_events([stalled]) == ["stalled"]
+    assert marked_events([stalled, hit]) == ["collision", "stalled"]
+    assert marked_events([]) == []
 
 
 def test_far_from_the_origin_costs_no_precision():

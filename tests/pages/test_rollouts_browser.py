@@ -69,24 +69,39 @@ def test_rows_sort_filter_and_open(browser, usual_run):
     choose(browser, "rollouts-words", "3DGS urban", "input")
     assert set(column(browser, "scene")) == {"urban/left-turn"}
     assert set(column(browser, "renderer")) == {"3dgs"}
-    choose(browser, "rollouts-state", "4", "change")
+    choose(browser, "rollouts-state", "ended not run", "change")
     assert count(browser) == "2 of 72 rollouts"
-    assert set(column(browser, "outcome")) == {"failed"}
+    assert set(column(browser, "outcome")) == {"not run"}
     choose(browser, "rollouts-more", "plan_deviation", "change")
     assert column(browser, "plan_deviation") == ["\u2014", "\u2014"]
     browser.evaluate(f"{ROWS}[0].querySelector('button.open').click()")
     text = browser.evaluate("document.getElementById('rollouts-picked').textContent")
-    assert "failed" in text
+    assert "not run" in text
     assert "NaN pixels <b>" in text  # of the failure, as text
     link = browser.evaluate("document.querySelector('#rollouts-picked a')?.getAttribute('href')")
     assert link is None or (usual_run / link).is_dir()
     choose(browser, "rollouts-words", "", "input")
-    choose(browser, "rollouts-state", "0", "change")
+    choose(browser, "rollouts-state", "", "change")
     browser.evaluate(f"{ROWS}.at(-1).click()")
     assert (
         usual_run
         / browser.evaluate("document.querySelector('#rollouts-picked a').getAttribute('href')")
     ).is_dir()
+    assert browser.complaints == []
+
+
+def test_each_choice_of_the_filter_keeps_as_many_as_it_says(browser, usual_run):
+    opened(browser, write_report(usual_run))
+    options = browser.evaluate(
+        "[...document.querySelectorAll('#rollouts-state option')].map(o => [o.value, o.textContent])"
+    )
+    ended = 0
+    for value, text in options:
+        choose(browser, "rollouts-state", value, "change")
+        n = int(text.split("(")[-1].rstrip(")"))
+        assert count(browser) in (f"{n} of 72 rollouts", "72 rollouts")
+        ended += n if value.startswith("ended ") else 0
+    assert ended == 72
     assert browser.complaints == []
 
 

@@ -278,11 +278,11 @@ class Birdseye {
     context.globalAlpha = 1;
   }
 
-  // Collisions are round and departures from the road square, as in the report; faint before they happen.
+  // Collisions are round and other events of the ego square, as in the report; faint before they happen.
   marks(drive, t, px) {
     const { context } = this, r = 6 * px;
     for (const moment of drive.moments) {
-      if (moment.t === null || !["collision", "offroad"].includes(moment.kind)) continue;
+      if (moment.t === null || ["frame", "plans"].includes(moment.kind)) continue;
       const { x, y } = heldPose(drive.ego, moment.t);
       context.globalAlpha = t >= moment.t ? 1 : 0.3;
       context.beginPath();

@@ -3,7 +3,7 @@
   const holder = document.getElementById("rollouts-data");
   if (!holder) return;
   const ROW = 34, SPARE = 8; // height of a row in pixels, as in the style sheet; rows drawn beyond the edges
-  const COLLIDED = 1, OTHERWISE = 2, FAILED = 4, HAS_FOLDER = 8, HAS_CLIP = 16, HAS_WHY = 32;
+  const HAS_FOLDER = 1, HAS_CLIP = 2, HAS_WHY = 4;
   const at = (id) => document.getElementById(id);
   const box = at("rollouts-box"), table = at("table-rollouts"), head = table.tHead.rows[0], body = table.tBodies[0], picked = at("rollouts-picked");
   const make = (tag, text, more = {}) => Object.assign(document.createElement(tag), text === undefined ? {} : { textContent: text }, more);
@@ -14,7 +14,7 @@
     return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).json();
   };
 
-  const start = ({ renderers, texts, state, numbers }) => {
+  const start = ({ coloured: [colouredBy, coloured], kinds, endings, texts, had, state, numbers }) => {
     const rows = state.length, text = (name, row) => texts[name][row];
     const shortly = new Intl.NumberFormat("en", { minimumSignificantDigits: 4, maximumSignificantDigits: 4, useGrouping: false });
     const number = (one, row) => {
@@ -26,7 +26,29 @@
     };
     const quoted = (word) => /^[\w./@+-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`; // for a shell
     const outcome = (row) => text("outcome", row);
-    const tone = (row) => state[row] & FAILED ? "failed" : state[row] & COLLIDED ? "collision" : state[row] & OTHERWISE ? "offroad" : "";
+    const tone = (row) => text("tone", row);
+    // The gravest outcome has the lowest bit; what could not be run comes after every outcome.
+    const gravity = (row) => had[row] ? kinds.length - Math.log2(had[row] & -had[row]) : tone(row) ? 0.5 : 0;
+
+    // What a choice of the filter keeps, by its value: everything; an event; one outcome; one ending.
+    const keeps = new Map([["", () => true], ["event", (row) => had[row] !== 0]]);
+    kinds.forEach(([name], bit) => keeps.set("had " + name, (row) => (had[row] >> bit) & 1));
+    endings.forEach((name) => keeps.set("ended " + name, (row) => text("ending", row) === name));
+    const choice = at("rollouts-state");
+    const offer = (holder, value, words) => {
+      const n = texts.scene.reduce((sum, _, row) => sum + (keeps.get(value)(row) ? 1 : 0), 0);
+      holder.append(make("option", `${words} (${n})`, { value }));
+    };
+    offer(choice, "", "all");
+    if (kinds.length) {
+      const group = make("optgroup", undefined, { label: "had, alone or among others" });
+      offer(group, "event", "any event");
+      for (const [name, words] of kinds) offer(group, "had " + name, words);
+      choice.append(group);
+    }
+    const group = make("optgroup", undefined, { label: "ended, each rollout once" });
+    for (const name of endings) offer(group, "ended " + name, name);
+    choice.append(group);
 
     // Which columns are drawn: names, the outcome, the headline numbers that are no flags, and one more of choice.
     const more = at("rollouts-more");
@@ -44,20 +66,20 @@
       return new Map([...new Set(texts[name])].sort(compare).map((value, place) => [value, place]));
     };
     const keyOf = (one) => {
-      if (one.name === "outcome") return (row) => state[row] & (COLLIDED | OTHERWISE | FAILED);
+      if (one.name === "outcome") return gravity;
       if (!one.names) return (row) => one.data[row] ?? NaN;
       const rank = ranks(one.name);
       return (row) => rank.get(text(one.name, row));
     };
 
     const select = () => {
-      const mask = Number(at("rollouts-state").value);
+      const keep = keeps.get(choice.value);
       const words = at("rollouts-words").value.toLowerCase().split(/\s+/).filter(Boolean);
       const has = (row, word) => text("seed", row) === word || ["scene", "renderer", "policy"].some((name) => text(name, row).toLowerCase().includes(word));
       const kept = new Uint32Array(rows);
       let n = 0;
       for (let row = 0; row < rows; row++) {
-        if ((!mask || state[row] & mask) && words.every((word) => has(row, word))) kept[n++] = row;
+        if (keep(row) && words.every((word) => has(row, word))) kept[n++] = row;
       }
       order = kept.slice(0, n);
       const chosen = shown.find((one) => one.name === sorted.name);
@@ -95,9 +117,9 @@
       for (const one of shown) {
         const td = make(one.name === "scene" ? "th" : "td", undefined, { className: one.names || one.name === "outcome" ? "name" : "r nowrap" });
         if (one.name === "scene") td.scope = "row";
-        if (one.name === "renderer") {
+        if (one.name === colouredBy) {
           td.append(make("span", "", { className: "swatch" }));
-          td.firstChild.style.setProperty("--c", `var(--variant-${renderers.indexOf(text("renderer", row)) % 8})`);
+          td.firstChild.style.setProperty("--c", `var(--variant-${coloured.indexOf(text(colouredBy, row)) % 8})`);
         }
         if (one.name === "seed") {
           const open = make("button", text("seed", row), { type: "button", className: "open", title: "Numbers and files of this rollout" });
@@ -151,7 +173,7 @@
     });
     more.addEventListener("change", () => { shown = drawn(); heads(); select(); });
     at("rollouts-words").addEventListener("input", select);
-    at("rollouts-state").addEventListener("change", select);
+    choice.addEventListener("change", select);
     new ResizeObserver(draw).observe(box);
     heads();
     select();
