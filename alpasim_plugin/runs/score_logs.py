@@ -6,6 +6,7 @@ import glob
 import os
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,6 +42,8 @@ from alpasim_plugin.runs.scoring import Scores, tabulate
 from evaluators import score
 from evaluators.alpasim import ScoredRollout
 from evaluators.metrics.presets import Preset
+from evaluators.results import Failures
+from evaluators.statistics.verdicts import outcome_of_failures
 from scenarios.load import load_scenario, scene_id_of
 from scenarios.suite import ScenarioRef, load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id
@@ -349,17 +352,22 @@ def _named(*versions: str | None) -> str:
 def exit_code(
     scores: Sequence[LogScore], failures_allowed: bool, aggregate_error: EvaluatorError | None
 ) -> int:
-    """Return the process exit code: 2 for a log that cannot be read, 5 for one that cannot be
-    scored, 4 for a rollout cut short.
+    """Return the process exit code: 5 for a log that cannot be scored, 4 for a rollout cut short, 2
+    for a log that cannot be read; where several meet, the order of all verbs decides.
+
+    Args:
+        scores: Of every log.
+        failures_allowed: Rollouts cut short are accepted.
+        aggregate_error: Why AlpaSim's aggregation could not be made.
     """
-    classes = {
-        log_score.manifest.failure_class for log_score in scores if not log_score.manifest.ok
-    }
-    if "input" in classes:
-        return 2
-    if "evaluator" in classes or aggregate_error is not None:
-        return 5
-    return 4 if classes and not failures_allowed else 0
+    classes = [
+        log_score.manifest.failure_class or "" for log_score in scores if not log_score.manifest.ok
+    ]
+    if failures_allowed:
+        classes = [name for name in classes if name in ("input", "evaluator")]
+    if aggregate_error is not None:
+        classes.append("evaluator")
+    return outcome_of_failures(Failures(len(classes), len(scores), Counter(classes))).exit_code
 
 
 class KnownScenes:

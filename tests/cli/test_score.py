@@ -9,6 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import EvaluatorError
+from alpasim_plugin.runs.score_logs import LogScore, exit_code
+from tests import run_records
 
 GOLDEN_SCENE = "synthetic-cut-in-a"
 
@@ -295,3 +298,27 @@ def test_a_file_that_is_no_log_is_an_error_without_a_table(tmp_path, capsys):
     command = ["score", str(path), "--scene", "smoke/straight", "--out", str(tmp_path / "out")]
     assert run_command(command) == 2
     assert "primary rate" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("classes", "wanted"),
+    [
+        ((), 0),
+        (("input",), 2),
+        (("infrastructure",), 4),
+        (("evaluator",), 5),
+        (("input", "evaluator"), 5),
+        (("input", "infrastructure"), 4),
+        (("infrastructure", "evaluator"), 5),
+    ],
+)
+def test_failures_of_several_kinds_end_with_the_code_that_docs_give_the_gravest(classes, wanted):
+    scores = [LogScore(run_records.manifest({}), None)]
+    scores += [
+        LogScore(run_records.manifest({"status": "failed", "error": {"failure_class": name}}), None)
+        for name in classes
+    ]
+    assert exit_code(scores, False, None) == wanted
+    accepted = [name for name in classes if name != "infrastructure"]
+    assert exit_code(scores, True, None) == (5 if "evaluator" in accepted else 2 if accepted else 0)
+    assert exit_code(scores, True, EvaluatorError("no", "none")) == 5
