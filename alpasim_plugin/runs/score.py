@@ -22,7 +22,7 @@ from alpasim_plugin.log.run_folder.records import (
     SceneFacts,
     ScoreConfig,
 )
-from alpasim_plugin.log.run_folder.schema import AGGREGATE, slug
+from alpasim_plugin.log.run_folder.schema import AGGREGATE, is_named, slug
 from alpasim_plugin.log.run_folder.writer import (
     LoggedScene,
     unfinish,
@@ -277,6 +277,9 @@ def _run_info(
     evaluators: Sequence[PartSpec],
 ) -> RunInfo:
     manifests = [log_score.manifest for log_score in scores]
+    named = [
+        manifest for manifest in manifests if is_named(manifest.cell, manifest.ok)
+    ] or manifests
     left_out = {note for scene in scenes.values() for note in scene.notes}
     return RunInfo(
         key=key,
@@ -286,8 +289,8 @@ def _run_info(
             settings=None if settings is None else settings.model_dump(mode="json"),
         ),
         preset=preset.name,
-        renderers=tuple(dict.fromkeys(manifest.renderer for manifest in manifests)),
-        policies=tuple(dict.fromkeys(manifest.policy for manifest in manifests)),
+        renderers=tuple(dict.fromkeys(manifest.renderer for manifest in named)),
+        policies=tuple(dict.fromkeys(manifest.policy for manifest in named)),
         seeds=tuple(dict.fromkeys(manifest.seed for manifest in manifests)),
         scenes={
             name: SceneFacts(

@@ -32,6 +32,7 @@ from alpasim_plugin.log.run_folder.schema import (
     LOG_NAME,
     MANIFEST,
     RUN_INFO,
+    UNKNOWN,
     rollout_folder,
 )
 from alpasim_plugin.log.run_folder.writer import LoggedScene, write_steps
@@ -48,7 +49,6 @@ from scenarios.load import load_scenario, scene_id_of
 from scenarios.suite import ScenarioRef, load_suite
 from scenarios.usdz import read_usdz, usdz_scene_id
 
-UNKNOWN = "unknown"  # renderer or policy that a log does not name
 SKIPPED = "<skip>"
 # A seed other than the file's is part of the id.
 SEEDED = re.compile(r"(?P<own>.+)-seed(?P<seed>\d+)")

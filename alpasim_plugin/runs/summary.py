@@ -18,7 +18,7 @@ from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.log.run_folder.reader import table_path
 from alpasim_plugin.log.run_folder.records import Manifest, Pool, RunInfo
 from alpasim_plugin.log.run_folder.rows import rollouts_of_table
-from alpasim_plugin.log.run_folder.schema import ROLLOUTS, SUMMARY
+from alpasim_plugin.log.run_folder.schema import ROLLOUTS, SUMMARY, is_named
 from alpasim_plugin.log.run_folder.sides import AGAIN, RolloutTable
 from alpasim_plugin.log.run_folder.writer import write_tables
 from alpasim_plugin.runs.execute import Threads
@@ -133,7 +133,8 @@ def failures_of(manifests: Sequence[Manifest]) -> Failures:
 def _of_policies(manifests: Sequence[Manifest]) -> dict[str, list[Manifest]]:
     manifests_by_policy: dict[str, list[Manifest]] = {}
     for manifest in manifests:
-        manifests_by_policy.setdefault(manifest.policy, []).append(manifest)
+        if is_named(manifest.cell, manifest.ok):
+            manifests_by_policy.setdefault(manifest.policy, []).append(manifest)
     return manifests_by_policy
 
 

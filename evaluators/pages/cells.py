@@ -185,7 +185,8 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
     sides = run.policies if by_policy else sorted(run.renderers, key=lambda name: name != base)
     grouped: dict[tuple[str, str, int, int], list[Rollout]] = {}
     takes: Counter[tuple[str, str, str, int]] = Counter()
-    in_order = sorted(run.rollouts, key=lambda rollout: sides.index(getattr(rollout, side)))
+    rollouts = [rollout for rollout in run.rollouts if getattr(rollout, side) in sides]
+    in_order = sorted(rollouts, key=lambda rollout: sides.index(getattr(rollout, side)))
     for rollout in in_order:
         if wanted.takes(rollout):
             take = takes[rollout.cell]

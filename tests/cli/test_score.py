@@ -11,6 +11,9 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.runs.score_logs import LogScore, exit_code
+from evaluators.pages.html import write_report
+from evaluators.pages.overview import overview_of
+from evaluators.statistics.opening import read_run
 from tests import run_records
 
 GOLDEN_SCENE = "synthetic-cut-in-a"
@@ -322,3 +325,20 @@ def test_failures_of_several_kinds_end_with_the_code_that_docs_give_the_gravest(
     accepted = [name for name in classes if name != "infrastructure"]
     assert exit_code(scores, True, None) == (5 if "evaluator" in accepted else 2 if accepted else 0)
     assert exit_code(scores, True, EvaluatorError("no", "none")) == 5
+
+
+def test_a_log_that_cannot_be_read_is_no_variant_beside_the_others(our_run, tmp_path, capsys):
+    for number, log in enumerate(sorted(our_run.glob("rollouts/*/*/*/*/rollout.asl"))):
+        shutil.copy(log, tmp_path / f"{number}.asl")
+    (tmp_path / "broken.asl").write_bytes(b"no log")
+    logs = [str(path) for path in sorted(tmp_path.glob("*.asl"))]
+    scene = next((our_run / "scenes").glob("*.json")).stem.replace("-", "/", 1)
+    command = ["score", *logs, "--scene", scene, "--out", str(tmp_path / "scored"), "--json"]
+    assert run_command(command) == 2
+    capsys.readouterr()
+    run = read_run(tmp_path / "scored")
+    assert (run.renderers, run.policies) == (["clean"], ["log-replay"])
+    assert list(run.summary.metrics) == ["clean"]
+    assert (run.summary.failures.n_failed, len(run.rollouts)) == (1, len(logs))
+    assert sum(row.n_rollouts for row in overview_of(run).rows) == len(logs)
+    write_report(run)

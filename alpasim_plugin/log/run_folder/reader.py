@@ -120,19 +120,23 @@ class Run:
         )
 
     @property
+    def _named(self) -> list[Rollout]:
+        return [rollout for rollout in self.rollouts if rollout.is_named] or [*self.rollouts]
+
+    @property
     def renderers(self) -> list[str]:
         """List renderers in the order of the command."""
-        return _in_order(self.info.renderers, (r.renderer for r in self.rollouts))
+        return _in_order(self.info.renderers, (r.renderer for r in self._named))
 
     @property
     def policies(self) -> list[str]:
         """List policies in the order of the command."""
-        return _in_order(self.info.policies, (r.policy for r in self.rollouts))
+        return _in_order(self.info.policies, (r.policy for r in self._named))
 
     @property
     def scenes(self) -> list[str]:
         """List scene ids in the order of ``run.json``."""
-        return _in_order(self.info.scenes, (r.scene for r in self.rollouts))
+        return _in_order(self.info.scenes, (r.scene for r in self._named))
 
     def rollouts_of(self, variant: str) -> list[Rollout]:
         """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""

@@ -18,6 +18,7 @@ from alpasim_plugin.log.run_folder.schema import (
     ROLLOUTS_TABLE,
     VALID,
     cell_name,
+    is_named,
     metrics_in,
 )
 
@@ -47,6 +48,11 @@ class Rollout(CellStatus):
     steps: int | None = None
     log: str = ""
     metrics: Mapping[str, float | None] = field(default_factory=dict)
+
+    @property
+    def is_named(self) -> bool:
+        """Return whether it has names, which a log that cannot be read has not."""
+        return is_named(self.cell, self.ok)
 
     @property
     def key(self) -> RolloutKey:

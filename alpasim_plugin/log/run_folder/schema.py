@@ -176,6 +176,16 @@ STEPS_TABLE = TableSchema(
 )
 
 
+UNKNOWN = "unknown"  # renderer or policy that a log does not name; all three of an unreadable one
+
+
+def is_named(cell: Sequence[str | int], is_ok: bool) -> bool:
+    """Tell whether the rollout of a cell has names: a log that cannot be read has none, and its
+    `UNKNOWN` is no variant beside others.
+    """
+    return is_ok or any(name != UNKNOWN for name in cell[:3])
+
+
 SLUG_LENGTH = 80
 SEPARATOR = "/"  # joins the names of a cell, wherever one key stands for several
 

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.records import Manifest
-from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, metrics_in
+from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, is_named, metrics_in
 
 AGAIN = "Write the tables of this run again with its own command."
 
@@ -229,7 +229,7 @@ class RolloutTable:
 
     Attributes:
         metrics: Names, in the order of the columns.
-        renderers, policies: Names, in order of appearance.
+        renderers, policies: Names, in order of appearance; a log that cannot be read has none.
         n_rollouts: Rows.
     """
 
@@ -248,9 +248,11 @@ class RolloutTable:
         keys = self._read([*KEYS, "status"]).to_pydict()
         self._keys = list(zip(*(keys[name] for name in KEYS), strict=True))
         self.n_rollouts = len(self._keys)
-        self.renderers = list(dict.fromkeys(keys["renderer"]))
-        self.policies = list(dict.fromkeys(keys["policy"]))
         self._ok = np.array(keys["status"], dtype=object) == "ok"
+        keys_by_row = zip(self._keys, self._ok, strict=True)
+        named = [key for key, is_ok in keys_by_row if is_named(key, bool(is_ok))] or self._keys
+        self.renderers = list(dict.fromkeys(key[0] for key in named))
+        self.policies = list(dict.fromkeys(key[1] for key in named))
         self._failure_class = [None] * self.n_rollouts
         if "failure_class" in columns:
             self._failure_class = self._read(["failure_class"])[0].to_pylist()

@@ -117,7 +117,7 @@
       for (const one of shown) {
         const td = make(one.name === "scene" ? "th" : "td", undefined, { className: one.names || one.name === "outcome" ? "name" : "r nowrap" });
         if (one.name === "scene") td.scope = "row";
-        if (one.name === colouredBy) {
+        if (one.name === colouredBy && coloured.includes(text(colouredBy, row))) {
           td.append(make("span", "", { className: "swatch" }));
           td.firstChild.style.setProperty("--c", `var(--variant-${coloured.indexOf(text(colouredBy, row)) % 8})`);
         }
