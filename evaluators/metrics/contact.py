@@ -95,7 +95,7 @@ def begin_at_steps(contacts: Contacts, n_actors: int, n_steps: int) -> tuple[I64
     """Return at which steps ``(B,)`` which actors ``(B,)`` touch the ego that do not touch it at
     the step before.
     """
-    touch = np.zeros((n_actors, n_steps), np.bool_)
+    touch = np.zeros((n_actors, n_steps), dtype=np.bool_)
     touch[contacts.actor, contacts.step] = True
     before = np.zeros_like(touch)
     before[:, 1:] = touch[:, :-1]

@@ -155,7 +155,7 @@ def _first(cell_series: CellSeries, metric: str) -> int | None:
 
 
 def _is_on(cell_series: CellSeries, metric: str, t_us: int) -> bool:
-    times, values = cell_series.get(metric, (np.zeros(0, np.int64), np.zeros(0)))
+    times, values = cell_series.get(metric, (np.zeros(0, dtype=np.int64), np.zeros(0)))
     return bool((values[times == t_us] >= 0.5).any())
 
 
