@@ -6,6 +6,7 @@ builds it. Shipped parts and those of other packages register by entry points
 """
 
 from alpasim_plugin.core.interfaces import complete
+from alpasim_plugin.core.parts.grammar import split_names, split_settings
 from alpasim_plugin.core.parts.resolve import (
     RendererSpec,
     find,
@@ -14,8 +15,6 @@ from alpasim_plugin.core.parts.resolve import (
     require_installed,
     resolve,
     resolve_renderer,
-    split_names,
-    split_settings,
     unidentified,
 )
 from alpasim_plugin.core.parts.spec import PartSpec, build, digest

@@ -4,7 +4,6 @@ resolved part.
 
 import inspect
 import os
-import re
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,12 @@ from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.files.config import Document, apply_overrides, guess, validate
 from alpasim_plugin.core.interfaces import Declaration, require_methods
 from alpasim_plugin.core.lazy import installed
-from alpasim_plugin.core.parts.grammar import parse_renderer, split_label
+from alpasim_plugin.core.parts.grammar import (
+    parse_renderer,
+    split_label,
+    split_settings,
+    split_steps,
+)
 from alpasim_plugin.core.parts.registry import RegisteredPart, default_settings, entries
 from alpasim_plugin.core.parts.source import (
     absolute_target,
@@ -158,18 +162,15 @@ def unidentified(kind: KindName, name: str, overrides: Sequence[str] = ()) -> Pa
     """Resolve a name as far as building the part needs it: no file is read, and there is no digest.
     See `resolve`.
     """
-    plain = name
-    steps = None
+    plain, steps = split_steps(name) if kind == "fixer" else (name, None)
     address = None
-    if is_target(name):
-        target = absolute_target(name)
+    if is_target(plain):
+        target = absolute_target(plain)
     else:
         scheme, remote_address = split_address(name)
         if scheme:
             plain = scheme
             address = remote_address
-        elif kind == "fixer":
-            plain, steps = split_steps(name)
         target = find(kind, plain).target
     at_steps = () if steps is None else (f"steps={steps}",)
     if _declares_nothing(kind, target):
@@ -208,19 +209,20 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         InputError: As `resolve`; a step count without a fixer; a fixer of whole clips, or one
             without the weights that it needs.
     """
-    parsed = parse_renderer(name)
+    renderers = entries("renderer")
+    fixers = entries("fixer")
+    parsed = parse_renderer(name, fixers)
     bracket_settings = parsed.settings
     base = parsed.base
     front = f"{parsed.part}@{parsed.steps}" if parsed.steps else parsed.part
-    renderers = entries("renderer")
-    if not base and (front in renderers or "://" in front or _is_renderer(front)):
+    _require_file_or_fixer(parsed.part, fixers)
+    if not base and (front in renderers or "://" in front or _is_renderer(parsed.part)):
         if bracket_settings:
             raise InputError(
                 f"renderer {name!r}: {front!r} is no fixer: it has no settings for brackets",
                 "leave the brackets out, or name a fixer: onefixer[references=0]",
             )
         return RendererSpec(name, resolve("renderer", front))
-    fixers = entries("fixer")
     if not is_target(front) and split_steps(front)[0] not in fixers:
         if base and front in renderers and split_steps(base)[0] in fixers:
             raise InputError(
@@ -232,6 +234,19 @@ def resolve_renderer(name: str, overrides: Sequence[str] = ()) -> RendererSpec:
         fixer = replace(fixer, name=f"{fixer.name}[{','.join(bracket_settings)}]")
     _check_in_loop(fixer)
     return RendererSpec(name, resolve("renderer", base or BASE), fixer)
+
+
+def _require_file_or_fixer(part: str, fixers: Collection[str]) -> None:
+    """Refuse a path with a plus that leads to no file: what stands before the plus may have been
+    meant as a fixer.
+    """
+    file, _, _ = part.rpartition(":")
+    first, plus, _ = file.partition("+")
+    if plus and file.endswith(".py") and not os.path.isfile(file):
+        raise InputError(
+            f"renderer {part!r}: there is no file {file}, and no fixer {first!r}",
+            f"{guess(first, fixers)}name a file that exists, as FILE.py:Class, or a fixer before the +",
+        )
 
 
 def _check_in_loop(fixer: PartSpec) -> None:
@@ -255,38 +270,6 @@ def _is_renderer(name: str) -> bool:
     return hasattr(part, "render") or not hasattr(part, "step")
 
 
-def split_settings(name: str) -> tuple[str, tuple[str, ...]]:
-    """Split the settings in brackets off a name.
-
-    Raises:
-        InputError: Brackets without ``KEY=VALUE`` in them, or more than one pair.
-
-    Example:
-        >>> split_settings("onefixer[references=0,precision=fp32]+clean")
-        ('onefixer+clean', ('references=0', 'precision=fp32'))
-    """
-    if "[" not in name:
-        return name, ()
-    match = re.fullmatch(r"([^\[\]]+)\[([^\[\]]+)\]([^\[\]]*)", name)
-    settings = tuple(text.strip() for text in match[2].split(",")) if match else ()
-    if match is None or not all(re.fullmatch(r"[\w.]+=.+", text) for text in settings):
-        raise InputError(
-            f"renderer {name!r}: no settings in its brackets",
-            "write FIXER[KEY=VALUE,...]: onefixer[references=0]",
-        )
-    return match[1] + match[3], settings
-
-
-def split_names(text: str) -> list[str]:
-    """Split a list of names at its commas, but for those in brackets.
-
-    Example:
-        >>> split_names("3dgs, onefixer[references=0,recording=past]")
-        ['3dgs', 'onefixer[references=0,recording=past]']
-    """
-    return [name.strip() for name in re.split(r",(?![^\[]*\])", text) if name.strip()]
-
-
 def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
     """Return the settings of one renderer's fixer: those for all, then those for it alone.
 
@@ -297,22 +280,6 @@ def overrides_of(renderer: str, overrides: Sequence[str]) -> tuple[str, ...]:
     named = [split_label(text) for text in overrides]
     specific = (text for label, text in named if label == renderer)
     return (*(text for label, text in named if not label), *specific)
-
-
-def split_steps(name: str) -> tuple[str, int | None]:
-    """Split ``NAME@STEPS``.
-
-    Example:
-        >>> split_steps("onefixer@2"), split_steps("onefixer")
-        (('onefixer', 2), ('onefixer', None))
-    """
-    plain, separator, count = name.partition("@")
-    if separator and not re.fullmatch("[1-9][0-9]?", count):
-        raise InputError(
-            f"name {name!r}: {count!r} after @ is no step count",
-            "write NAME@STEPS, such as onefixer@2",
-        )
-    return plain, int(count) if separator else None
 
 
 def declaration_of(factory: Any, settings: BaseModel | None) -> Declaration:
