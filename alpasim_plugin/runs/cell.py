@@ -27,7 +27,7 @@ from alpasim_plugin.core.errors import (
 )
 from alpasim_plugin.core.files import content_of, places, real, some_of
 from alpasim_plugin.core.files.atomic import disk_error
-from alpasim_plugin.core.files.inputs import ABSENT, Inputs
+from alpasim_plugin.core.files.inputs import ABSENT, Inputs, remembered
 from alpasim_plugin.core.files.stage import announce
 from alpasim_plugin.core.interfaces import Policy, Renderer
 from alpasim_plugin.core.json_types import JsonObject
@@ -149,13 +149,16 @@ def run_cell(
     with _writing_manifest(cell, options, folder) as draft:
         planned = _scenario(cell) if load is None else load(cell.ref)
         scenario = replace(planned, stop_at_path_end=cell.stops_at_path_end)
-        with parts_print_to_stderr(folder / OUTPUT_NAME), _same_folder(), Inputs() as inputs:
+        with (
+            parts_print_to_stderr(folder / OUTPUT_NAME),
+            _same_folder(),
+            _stating_inputs(draft, cell, scenario, root),
+        ):
             parts = builder(cell, options, scenario, threads)
             announce(f"first frame of {cell.renderer.name}, which compiles kernels once")
             recorder = _drive(parts, cell, options, scenario, folder)
         require_same_code()
-        read = _not_planned(inputs, _parts_of_drive(cell), scenario, root)
-        draft.add(inputs=read, **recorder.facts())
+        draft.add(**recorder.facts())
         draft.add(**_facts_of(parts, has_fixer=cell.renderer.fixer is not None))
         draft.manifest = _scored(draft.manifest, root, cell, options, scenario)
         require_same_code()
@@ -172,26 +175,28 @@ def _parts_of_drive(cell: Cell) -> list[PartSpec]:
     return [part for part in parts if part is not None]
 
 
-def _not_planned(
+def _beside_plan(
     inputs: Inputs, parts: Sequence[PartSpec], scenario: Scenario, root: Path
-) -> dict[str, str]:
-    """Return what parts read that no key holds, by path: a later command reuses what they made only
-    while these files are as they were.
+) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return what parts read, or may remember, that no key holds, by path: a later command reuses what
+    they made only while these files are as they were. Return also which files that they read, or
+    declare, are others now: whoever rewrites its own file makes another result each time.
 
     What lies in the cache or in the run folder is no input, nor is a file that was removed since: a
     temporary one. A file that was edited since counts as it was read.
     """
-    held = {*scenario.files}
-    for part in parts:
-        held |= {str(real(path)) for path in (*part.files, *part.code)}
+    code = [path for part in parts for path in part.code]
+    declared = {str(real(path)): content for part in parts for path, content in part.files.items()}
+    held = {*scenario.files, *declared, *map(str, map(real, code))}
     written = [real(root), real(places.cache())]
-    return {
+    read = {
         path: content
         for path, content in inputs.files.items()
         if path not in held
         and not any(Path(path).is_relative_to(folder) for folder in written)
         and (content == ABSENT or content_of(path) != ABSENT)
     }
+    return remembered(code, read), tuple(changed_inputs(declared | read))
 
 
 def is_copied(manifest: Manifest) -> bool:
@@ -252,6 +257,21 @@ class _Draft:
     def add(self, **members: Any) -> None:
         """Set members."""
         self.manifest = replace(self.manifest, **members)
+
+
+@contextmanager
+def _stating_inputs(draft: _Draft, cell: Cell, scenario: Scenario, root: Path) -> Iterator[None]:
+    """Enter into a manifest what its rollout reads in the block, however that ends: a failure is that
+    of the files too.
+    """
+    inputs = Inputs()
+    try:
+        with inputs:
+            yield
+    finally:
+        parts = _parts_of_drive(cell)
+        read, rewritten = _beside_plan(inputs, parts, scenario, root)
+        draft.add(inputs=read, rewritten=rewritten)
 
 
 @contextmanager
@@ -495,7 +515,8 @@ def kept_failure(cell: Cell, manifest: Manifest) -> str:
     """Say that a failure is kept, and what would drive the rollout again."""
     parts = [cell.policy, cell.renderer.base, cell.renderer.fixer]
     files = [path for part in parts if part is not None for path in (*part.code, *part.files)]
-    edit = f"an edit of {some_of(files, 3)}" if files else "another version of simrun"
+    files += manifest.inputs
+    edit = f"an edit of {some_of(files)}" if files else "another version of simrun"
     return (
         f"{cell.folder.as_posix()}: failed before with this code and these files, not driven again; "
         f"{edit} drives it again, and so does removing {manifest.path}"
@@ -512,8 +533,12 @@ def _scored(
             folder / LOG_NAME, folder / FRAMES_NAME, scenario, options.preset, cell.evaluators
         )
     write_steps(folder, [cell.names | row for row in rows])
-    read = _not_planned(inputs, cell.evaluators, scenario, root)
-    return replace(scores.stated_in(manifest), score_inputs=read)
+    read, rewritten = _beside_plan(inputs, cell.evaluators, scenario, root)
+    return replace(
+        scores.stated_in(manifest),
+        score_inputs=read,
+        rewritten=tuple(dict.fromkeys((*manifest.rewritten, *rewritten))),
+    )
 
 
 @contextmanager

@@ -2,9 +2,10 @@
 now, by name.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 
-from alpasim_plugin.core.files import content_of, some_of
+from alpasim_plugin.core.files import content_of, real, some_of
 from alpasim_plugin.core.files.inputs import ABSENT
 from alpasim_plugin.core.parts import PartSpec
 from alpasim_plugin.log.run_folder.records import Manifest, PartFacts, RunInfo
@@ -12,6 +13,10 @@ from alpasim_plugin.runs.plan import SIMRUN, Cell, RunPlan
 
 OLDER = "it was driven by another version of simrun"
 SHOWN_FILES = 3
+REWRITTEN = (
+    "was changed during the rollout that read it; what rewrites a file that it reads "
+    "is made again by each command"
+)
 
 
 def changed_inputs(before: Mapping[str, str]) -> dict[str, str]:
@@ -35,7 +40,7 @@ def reasons(cell: Cell, manifest: Manifest, held: RunInfo | None, plan: RunPlan)
         held: ``run.json`` of that time; None where it is not known.
         plan: The run.
     """
-    changed = _file_changes(manifest.inputs, changed_inputs(manifest.inputs))
+    changed = _file_changes(manifest.inputs, changed_inputs(manifest.inputs), manifest.rewritten)
     before = manifest.made_of
     if before is None:
         return [OLDER]
@@ -46,13 +51,15 @@ def reasons(cell: Cell, manifest: Manifest, held: RunInfo | None, plan: RunPlan)
         if name not in before:
             changed.append(f"{name} is new")
         elif before[name] != now[name]:
-            changed += _files_of(name, held, plan) or [f"{name} is another one"]
+            files = _files_of(name, held, plan, manifest.rewritten)
+            changed += files or [f"{name} is another one"]
     return changed
 
 
 def score_reasons(manifest: Manifest, held: RunInfo | None, plan: RunPlan) -> list[str]:
     """Say why a rollout is scored again whose files are whole: the arguments are those of `reasons`."""
-    changed = _file_changes(manifest.score_inputs, changed_inputs(manifest.score_inputs))
+    now = changed_inputs(manifest.score_inputs)
+    changed = _file_changes(manifest.score_inputs, now, manifest.rewritten)
     if manifest.preset != plan.options.preset:
         changed.append(f"the preset was {manifest.preset}")
     stated = {} if held is None else held.parts
@@ -88,7 +95,9 @@ def sentence(count: int, all_reasons: Sequence[str], action: str = "driven") -> 
     return f"{rollouts} {action} again: {some_of(causes, SHOWN_FILES)}"
 
 
-def _files_of(name: str, held: RunInfo | None, plan: RunPlan) -> list[str]:
+def _files_of(
+    name: str, held: RunInfo | None, plan: RunPlan, rewritten: Collection[str]
+) -> list[str]:
     """Name the files by which a scene or a part differs from what ``run.json`` states of it."""
     if held is None:
         return []
@@ -102,13 +111,18 @@ def _files_of(name: str, held: RunInfo | None, plan: RunPlan) -> list[str]:
             continue
         stated = held.parts.get(f"{part.kind} {part.name}")
         if stated is not None:
-            changes += _changes_of_part(stated, part)
+            changes += _changes_of_part(stated, part, rewritten)
     return changes
 
 
-def _changes_of_part(stated: PartFacts, part: PartSpec) -> list[str]:
+def _changes_of_part(
+    stated: PartFacts, part: PartSpec, rewritten: Collection[str] = ()
+) -> list[str]:
     """Name the files by which a part differs from what ``run.json`` states of it."""
-    return [*_file_changes(stated.code, part.code), *_file_changes(stated.files, part.files)]
+    return [
+        *_file_changes(stated.code, part.code),
+        *_file_changes(stated.files, part.files, rewritten),
+    ]
 
 
 def _is_part_of(part: str, kind: str, label: str, plan: RunPlan) -> bool:
@@ -120,14 +134,33 @@ def _is_part_of(part: str, kind: str, label: str, plan: RunPlan) -> bool:
     return part in {f"{one.kind} {one.name}" for one in parts}
 
 
-def _file_changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Name what happened to files: edited, gone, or read for the first time."""
+def _file_changes(
+    before: Mapping[str, str], now: Mapping[str, str], rewritten: Collection[str] = ()
+) -> list[str]:
+    """Name what happened to files: edited, gone, read for the first time, or changed already while they
+    were read.
+    """
     changes = []
     for path, content in now.items():
         if path not in before:
             changes.append(f"{path} was not read before")
-        elif content == ABSENT != before[path]:
+        elif content == before[path]:
+            continue
+        elif str(real(path)) in rewritten:
+            changes.append(f"{path} {REWRITTEN}")
+        elif content == ABSENT:
             changes.append(f"{path} is gone")
-        elif content != before[path]:
+        else:
             changes.append(f"{path} was edited")
     return changes
+
+
+def rewritten_files(manifests: Sequence[Manifest]) -> dict[str, str]:
+    """Return what ``run.json`` says of files that were changed while rollouts that read them were made,
+    by path.
+    """
+    counts = Counter(path for manifest in manifests for path in manifest.rewritten)
+    return {
+        path: f"{'1 rollout' if count == 1 else f'{count} rollouts'}: it {REWRITTEN}"
+        for path, count in counts.items()
+    }

@@ -91,7 +91,7 @@ def part_facts(part: PartSpec) -> PartFacts:
         files=dict(part.files),
         code=dict(part.code),
         unseen=part.unseen,
-        settings=None if part.settings is None else part.settings.model_dump(mode="json"),
+        settings=None if part.settings is None else part.settings.model_dump(),
     )
 
 

@@ -41,6 +41,7 @@ from alpasim_plugin.log.run_folder.schema import (
 from alpasim_plugin.log.run_folder.writer import unfinish, write_scene, writing
 from alpasim_plugin.renderers.reconstruction_key import model_key
 from alpasim_plugin.runs.cell import users_parts
+from alpasim_plugin.runs.changes import rewritten_files
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import prepare_workers
@@ -286,7 +287,7 @@ def finish_run(
     """
     n_failed = sum(not manifest.ok for manifest in manifests)
     outcome = RunCounts(len(manifests), n_failed)  # for lists of many runs
-    info = replace(info, outcome=outcome, rollouts=None)
+    info = replace(info, outcome=outcome, rollouts=None, rewritten=rewritten_files(manifests))
     folders = tuple(manifest.path for manifest in manifests)
     if folders != cells_of_run(info):
         info = replace(info, rollouts=folders)

@@ -286,7 +286,7 @@ def _run_info(
         command=tuple(command),
         config=ScoreConfig(
             preset=preset.as_dict(),
-            settings=None if settings is None else settings.model_dump(mode="json"),
+            settings=None if settings is None else settings.model_dump(),
         ),
         preset=preset.name,
         renderers=tuple(dict.fromkeys(manifest.renderer for manifest in named)),

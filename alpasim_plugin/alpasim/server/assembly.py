@@ -28,6 +28,7 @@ from alpasim_plugin.core.files import file_sha256, read_bytes
 from alpasim_plugin.core.parts import RendererSpec
 from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.queries import options_of
+from alpasim_plugin.core.typed_json import to_plain
 from alpasim_plugin.log.wire import api_version, common_pb2
 from alpasim_plugin.log.wire.services import Stub, channel_options
 
@@ -56,7 +57,7 @@ def version_of(
     part = spec.base if spec.fixer is None else spec.fixer
     name = "identity" if spec.fixer is None and upstream is not None else spec.name
     weights = digest(sorted(part.files.values()))
-    part_settings = None if part.settings is None else part.settings.model_dump(mode="json")
+    part_settings = to_plain(part.settings)
     base = None if upstream is not None else spec.base.digest
     everything = digest([__version__, name, part.digest, base, part_settings, settings])
     short = f"weights={weights[:12]}" if part.files else "weights=none"

@@ -21,18 +21,22 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar, Token
 from io import BufferedReader
 from pathlib import Path
 
+from alpasim_plugin.core.typed_json import to_plain
+
+ARRAY = "!array"  # marks an array among settings
 ABSENT = "absent"  # the content of a file that was looked for and is not there
 # A file that was changed so recently may change again without another time of change.
 SETTLED_NS = 2_000_000_000
 
 _open: ContextVar[tuple[Inputs, ...]] = ContextVar("records that are open", default=())
-_digests: dict[tuple[int, int, int, int], str] = {}  # device, inode, size, time of change
+_digests: dict[tuple[int, ...], str] = {}  # device, inode, size, times of change
+_read_by: dict[str, dict[str, str]] = {}  # module -> what was read while its code ran
 
 
 class Inputs:
@@ -83,14 +87,16 @@ class Inputs:
 
 def _plain(value: object) -> object:
     """Return what JSON can write; an array by its digest."""
-    if hasattr(value, "dtype") and hasattr(value, "tobytes"):  # of numpy, which is not loaded here
+    if hasattr(value, "tobytes") and getattr(value, "shape", ()) != ():  # of numpy, not loaded here
         content = hashlib.sha256(value.tobytes()).hexdigest()
-        return [str(value.dtype), list(getattr(value, "shape", ())), content]
-    if isinstance(value, Mapping):
-        return {str(name): _plain(part) for name, part in value.items()}
+        return {
+            ARRAY: [str(getattr(value, "dtype", "")), list(getattr(value, "shape", ())), content]
+        }
+    if isinstance(value, Mapping) and all(isinstance(name, str) for name in value):
+        return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(part) for part in value]
-    return value
+    return to_plain(value)
 
 
 @contextmanager
@@ -131,6 +137,25 @@ def note_files(files: Mapping[str, str]) -> None:
             record.files.setdefault(name, content)
 
 
+def remembered(modules: Collection[str], files: Mapping[str, str]) -> dict[str, str]:
+    """Return what code of these modules has read in this process, now and before: it may remember it, so
+    that only the first of several makers reads a file.
+
+    What modules have read together counts for each of them, since one that two parts import may
+    remember for both.
+
+    Args:
+        modules: Names or paths, under which what was read is held.
+        files: What was read just now: a record made by `Inputs`.
+    """
+    for module in modules:
+        _read_by.setdefault(module, {}).update(files)
+    everything = dict(files)
+    for module in modules:
+        everything = _read_by[module] | everything
+    return everything
+
+
 def content_digest(stream: BufferedReader) -> str:
     """Return the SHA-256 of an open file's content, computed once while the file stays as it is.
 
@@ -138,12 +163,13 @@ def content_digest(stream: BufferedReader) -> str:
     the next change.
     """
     state = os.fstat(stream.fileno())
-    identity = state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns
+    times_ns = state.st_mtime_ns, state.st_ctime_ns
+    identity = (state.st_dev, state.st_ino, state.st_size, *times_ns)
     if identity in _digests:
         return _digests[identity]
     stream.seek(0)
     digest = hashlib.file_digest(stream, "sha256").hexdigest()
     stream.seek(0)
-    if time.time_ns() - state.st_mtime_ns > SETTLED_NS:
+    if time.time_ns() - max(times_ns) > SETTLED_NS:
         _digests[identity] = digest
     return digest

@@ -21,7 +21,7 @@ from typing import Any
 from alpasim_plugin import OWN_PACKAGES
 from alpasim_plugin.core.errors import InputError, is_interruption
 from alpasim_plugin.core.files import file_sha256, read_bytes
-from alpasim_plugin.core.files.inputs import Inputs, note_files, unrecorded
+from alpasim_plugin.core.files.inputs import Inputs, note_files, remembered, unrecorded
 from alpasim_plugin.core.parts.blame import raised
 
 OWN_ROOT = str(Path(__file__).resolve().parents[3])
@@ -34,10 +34,8 @@ DO_THIS = (
 IN_A_FILE = (
     "Correct the file; it can import what is installed, and what lies beside it as 'import helper'."
 )
-_imported_code: dict[Path, str] = {}  # file -> its code digest when a part of it was first resolved
+_imported_code: dict[str, str] = {}  # file -> its digest when a part that imports it was resolved
 _served: dict[str, str] = {}  # module -> file, of modules that no folder on Python's path has
-# What modules read while they were imported, by module: whoever loads a part of one is made of it.
-_read_at_import: dict[str, dict[str, str]] = {}
 
 
 @lru_cache(maxsize=1)
@@ -81,6 +79,16 @@ def code_files(file: str | Path) -> dict[str, str]:
     if Path(os.path.relpath(path, OWN_ROOT)).parts[0] in OWN_PACKAGES:
         return {}
     return {module: file_sha256(module) for module in sorted(_reached(path, everywhere=True))}
+
+
+@unrecorded()
+def _modules_behind(target: str) -> set[str]:
+    """Return the paths of a target's module and of all that it imports; of simrun's own its name."""
+    name, _, _ = target.rpartition(":")
+    if name.partition(".")[0] in OWN_PACKAGES:
+        return {name}
+    file = file_of(target)
+    return set() if file is None else _reached(os.path.realpath(file), everywhere=True)
 
 
 def reached(file: str | Path) -> set[str]:
@@ -249,7 +257,8 @@ def load(target: str, kind: str) -> Any:
         with Inputs() as inputs:
             module = importlib.import_module(module_name)
             member = getattr(module, attribute, None)  # a module of a file runs here
-        note_files(_read_at_import.setdefault(module_name, inputs.files))
+        # Whoever loads a part is made of what its modules read when they were imported.
+        note_files(remembered(_modules_behind(target), inputs.files))
     except InputError:
         raise
     except BaseException as error:  # whatever a user's module raises while it is imported
@@ -362,14 +371,17 @@ def file_of(target: str) -> Path | None:
 
 
 def require_unedited(file: Path) -> None:
-    """Refuse a module whose code on disk is no longer the code that this process has imported.
+    """Refuse a module that, or one of whose imports, is no longer on disk as this process has imported
+    it.
 
     Raises:
-        InputError: Its `code_digest` is another than when a part of it was first resolved here.
+        InputError: A file of its code is another than when a part that imports it was first resolved
+            in this process.
     """
-    digest = code_digest(file)
-    if _imported_code.setdefault(file, digest) != digest:
-        raise InputError(
-            f"{file}: it, or a module that it imports, was edited after this process imported it",
-            "start a new process",
-        )
+    for path, content in code_files(file).items():
+        if _imported_code.setdefault(path, content) != content:
+            imported_by = "" if os.path.realpath(file) == path else f", which {file} imports,"
+            raise InputError(
+                f"{path}{imported_by} was edited after this process imported it",
+                "start a new process",
+            )

@@ -28,6 +28,7 @@ from alpasim_plugin.core.interfaces import complete, contract_error
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.core.parts.blame import blaming
 from alpasim_plugin.core.parts.source import code_digest, load, make_importable
+from alpasim_plugin.core.typed_json import to_plain
 from alpasim_plugin.core.types import shielded
 
 # entry points of what calls a fixer of blocks: (runner, make_fixer, settings, first) -> Renderer
@@ -165,7 +166,7 @@ def part_digest(
         files: SHA-256 by name; a name that is a dotted key of the settings takes the place of the
             path that stands there.
     """
-    content = None if settings is None else settings.model_dump(mode="json")
+    content = to_plain(settings)
     for name in files:
         *outer, last = name.split(".")
         node: Any = content

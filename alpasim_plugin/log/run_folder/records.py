@@ -8,7 +8,7 @@ where it is None: it does not apply.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Annotated, Any, Literal
 
@@ -16,10 +16,11 @@ from pydantic import BeforeValidator
 
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.metric_types import MetricInfo
+from alpasim_plugin.core.typed_json import from_plain, to_plain
 from alpasim_plugin.core.types import Direction
 from alpasim_plugin.log.run_folder.checksums import FileFacts
 
-INFINITE = ("inf", "-inf")  # JSON has no number for them
+INFINITE = ("inf", "-inf")  # the text of a metric's value for which JSON has no number
 
 
 def _number_of(value: object) -> object:
@@ -28,6 +29,8 @@ def _number_of(value: object) -> object:
 
 
 Number = Annotated[float, BeforeValidator(_number_of)]  # may be infinite
+# Values of any kind, of which the file holds what `alpasim_plugin.core.typed_json` says.
+Values = Annotated[JsonObject, BeforeValidator(from_plain)]
 Status = Literal["ok", "failed"]
 
 
@@ -85,13 +88,13 @@ class SceneFacts:
     content_hash: str = ""
     files: dict[str, str] = field(default_factory=dict)
     seed: int | None = None
-    varied: dict[str, list[Any]] = field(default_factory=dict)
+    varied: Values = field(default_factory=dict)
     duration_s: float | None = None
-    rates: JsonObject | None = None
-    latency: JsonObject | None = None
-    degradation: JsonObject | None = None
-    environment: JsonObject | None = None
-    vehicle: JsonObject | None = None
+    rates: Values | None = None
+    latency: Values | None = None
+    degradation: Values | None = None
+    environment: Values | None = None
+    vehicle: Values | None = None
     reconstruction: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -120,7 +123,7 @@ class PartFacts:
     files: dict[str, str]
     code: dict[str, str]
     unseen: str
-    settings: JsonObject | None
+    settings: Values | None
 
 
 @dataclass(frozen=True)
@@ -385,6 +388,8 @@ class Manifest(CellStatus):
         inputs: Path of each file that was read while it was driven, beside what ``made_of`` holds ->
             digest.
         score_inputs: The same, while it was scored.
+        rewritten: Files among those, and among those that parts declare, that were changed during the
+            rollout or its scoring: each command makes it again.
         frames: Camera frames.
         first_call_frames: Those of the first call, which may compile or fill caches.
         steps: Control steps.
@@ -424,6 +429,7 @@ class Manifest(CellStatus):
     video: str | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     score_inputs: dict[str, str] = field(default_factory=dict)
+    rewritten: tuple[str, ...] = ()
     frames: int | None = None
     first_call_frames: int | None = None
     steps: int | None = None
@@ -432,10 +438,10 @@ class Manifest(CellStatus):
     ended: str | None = None
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
     session_uuid: str | None = None
-    fixer: JsonObject = field(default_factory=dict)
+    fixer: Values = field(default_factory=dict)
     has_camera: bool | None = None
-    renderer_facts: JsonObject | None = None
-    policy_facts: JsonObject | None = None
+    renderer_facts: Values | None = None
+    policy_facts: Values | None = None
     metrics: dict[str, MetricValue] = field(default_factory=dict)
     events: tuple[DriveEvent, ...] = ()
     contacts: tuple[Contact, ...] = ()
@@ -496,8 +502,8 @@ class ScoreConfig:
         settings: AlpaSim's, with its preset.
     """
 
-    preset: JsonObject
-    settings: JsonObject | None
+    preset: Values
+    settings: Values | None
 
 
 @dataclass(frozen=True)
@@ -525,6 +531,8 @@ class RunInfo:
         code: Digests of simrun's code.
         metrics: METRIC -> what it is.
         unseen: ``KIND NAME`` -> what the digest of a part cannot cover.
+        rewritten: Path of each file that was changed while a rollout that read it was made -> what
+            follows for its rollouts, in words.
         weights: File of weights -> digest.
         hardware: Processor, cores, memory and operating system.
         versions: Library -> version.
@@ -564,8 +572,9 @@ class RunInfo:
     code: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, MetricInfo] = field(default_factory=dict)
     unseen: dict[str, str] = field(default_factory=dict)
+    rewritten: dict[str, str] = field(default_factory=dict)
     weights: dict[str, str] = field(default_factory=dict)
-    hardware: JsonObject = field(default_factory=dict)
+    hardware: Values = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     pool: Pool | None = None
@@ -573,10 +582,10 @@ class RunInfo:
     repeat: Repeat | None = None
     outcome: RunCounts | None = None
     rollouts: tuple[str, ...] | None = None
-    boundary: JsonObject | None = None
+    boundary: Values | None = None
     fork: Fork | None = None
     logs: tuple[str, ...] | None = None
-    alpasim: JsonObject | None = None
+    alpasim: Values | None = None
     exit_code: int | None = None
 
     @property
@@ -602,6 +611,9 @@ def json_of(record: object) -> JsonObject:
         value = getattr(record, member.name)
         if value is None and member.default is None:
             continue
+        if isinstance(record, MetricValue) and isinstance(value, float) and math.isinf(value):
+            content[member.name] = str(value)
+            continue
         content[member.name] = _plain(value)
     return content
 
@@ -612,13 +624,16 @@ def _plain(value: Any) -> Any:
         return metric_as_json(value)
     if is_dataclass(value):
         return json_of(value)
-    if isinstance(value, Mapping):
+    if isinstance(value, Mapping) and _holds_records(value.values()):
         return {key: _plain(member) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(member) for member in value]
-    if isinstance(value, float) and math.isinf(value):
-        return str(value)
-    return value
+    return to_plain(value)
+
+
+def _holds_records(members: Iterable[Any]) -> bool:
+    """Tell whether a mapping has records as members."""
+    return any(is_dataclass(member) for member in members)
 
 
 ALWAYS_STATED = ("unit", "direction", "aggregation", "help")  # members of every metric
