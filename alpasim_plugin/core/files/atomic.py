@@ -8,10 +8,12 @@ path before is untouched.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+BACKUP = ".simrun-backup"
+MOMENT_S = 0.4  # for a process between the two renames of a folder
+WORKING_FOLDER = -100  # of Linux's renameat2, like the next
+EXCHANGE = 2
 NO_PATH = (errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
 
@@ -80,8 +86,9 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a new empty folder; it replaces ``folder`` when the block ends, and is removed if the
     block raises.
 
-    A folder cannot be renamed onto an existing one: the existing one is renamed to a backup first.
-    Where the process is killed between the two renames, `restore_folder` brings the backup back.
+    The two change places in one step where the file system can do that. Elsewhere a folder cannot be
+    renamed onto an existing one: the existing one is renamed to a backup first, and where the process
+    is killed between the two renames, `restore_folder` brings the backup back.
 
     Raises:
         InfrastructureError: The disk refuses.
@@ -92,32 +99,75 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
         restore_folder(folder)
         partial.mkdir(parents=True)
         yield partial
-        if os.path.exists(folder):
-            shutil.rmtree(old, ignore_errors=True)
+        if not os.path.exists(folder):
+            partial.replace(folder)
+        elif not _change_places(partial, folder):
+            _remove(old)
             folder.replace(old)
-        partial.replace(folder)
+            partial.replace(folder)
     except OSError as error:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(InfrastructureError):
             restore_folder(folder)
         raise disk_error(folder, error) from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        _remove(partial)
         if os.path.exists(folder):
-            shutil.rmtree(old, ignore_errors=True)
+            _remove(old)
+
+
+def _change_places(first: Path, second: Path) -> bool:
+    """Let two paths change places in one step, so that neither is ever missing; return whether this
+    system and the file system can do that.
+    """
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError):  # another system than Linux
+        return False
+    paths = os.fsencode(first.absolute()), os.fsencode(second.absolute())
+    return bool(rename(WORKING_FOLDER, paths[0], WORKING_FOLDER, paths[1], EXCHANGE) == 0)
+
+
+def _remove(path: Path) -> None:
+    """Remove a folder, or a link to one, if it is there."""
+    if path.is_symlink():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _backup_of(folder: Path) -> Path:
     """Return the name of the backup of a folder that is being replaced."""
-    return folder.with_name(f".{folder.name}.simrun-backup")
+    return folder.with_name(f".{folder.name}{BACKUP}")
 
 
 def restore_folder(folder: Path) -> None:
     """Bring back the backup that `atomic_folder` had made when its process was killed; whoever
     looks for a folder that is written so calls this first.
+
+    A process that is just about to put the new folder there is given a moment.
+
+    Raises:
+        InfrastructureError: The disk refuses.
     """
     old = _backup_of(folder)
-    if os.path.exists(old) and not os.path.exists(folder):
-        old.replace(folder)
+    until_s = time.monotonic() + MOMENT_S
+    try:
+        while os.path.exists(old) and not os.path.exists(folder):
+            if time.monotonic() > until_s:
+                old.replace(folder)
+            time.sleep(MOMENT_S / 10)
+    except FileNotFoundError:  # another process has brought it back
+        return
+    except OSError as error:
+        raise disk_error(folder, error) from error
+
+
+def restore_folders(parent: Path) -> None:
+    """Bring back the backups of all folders in a folder; whoever lists folders that are written with
+    `atomic_folder` calls this first. See `restore_folder`.
+    """
+    for old in parent.glob(f".*{BACKUP}"):
+        restore_folder(old.with_name(old.name[1:].removesuffix(BACKUP)))
 
 
 @contextmanager

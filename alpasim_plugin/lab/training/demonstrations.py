@@ -18,7 +18,12 @@ from typing_extensions import TypedDict
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_json_as, read_json_object
 from alpasim_plugin.core.files.arrays import open_npy
-from alpasim_plugin.core.files.atomic import atomic_folder, write_json
+from alpasim_plugin.core.files.atomic import (
+    atomic_folder,
+    restore_folder,
+    restore_folders,
+    write_json,
+)
 from alpasim_plugin.core.geometry import inverse, quat_from_yaw, se3, wrap_angle
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, U8, CameraSpec, RenderRequest, Route, Scenario
@@ -139,6 +144,7 @@ def write_demonstrations(
         "recipe": asdict(recipe),
     }
     info["version"] = DEMONSTRATIONS_VERSION
+    restore_folder(folder)
     path = folder / DEMONSTRATIONS_FILE
     if (
         path.exists()
@@ -366,6 +372,7 @@ def read_demonstrations(root: Path, split: str) -> Sequence[Demonstrations]:
     Raises:
         InputError: There are none.
     """
+    restore_folders(root / split)
     folders = sorted(
         p.parent
         for p in (root / split).glob(f"*/{DEMONSTRATIONS_FILE}")

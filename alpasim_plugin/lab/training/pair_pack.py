@@ -26,7 +26,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.arrays import open_npy
-from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder
+from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, restore_folder
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.pair_store import SEQUENCE_FILE, write_info
@@ -109,13 +109,13 @@ def unpack(path: Path, folder: Path) -> Path:
         names = archive.namelist()
         for name in names:
             split, sequence, *parts = name.split("/")
-            if (
-                parts == [SEQUENCE_FILE]
-                and not (folder / split / sequence / SEQUENCE_FILE).exists()
-            ):
+            if parts != [SEQUENCE_FILE]:
+                continue
+            if ".." in (split, sequence) or os.path.isabs(name):
+                raise ValueError(f"the name {name}")
+            restore_folder(folder / split / sequence)
+            if not (folder / split / sequence / SEQUENCE_FILE).exists():
                 start = f"{split}/{sequence}/"
-                if ".." in (split, sequence) or os.path.isabs(name):
-                    raise ValueError(f"the name {name}")
                 files = {one.removeprefix(start): one for one in names if one.startswith(start)}
                 contents = {one: archive.read(entry) for one, entry in files.items()}
                 _decode(contents, folder / split / sequence)

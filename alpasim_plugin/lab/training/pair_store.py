@@ -28,7 +28,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_json_object
 from alpasim_plugin.core.files.arrays import open_npy
-from alpasim_plugin.core.files.atomic import atomic_folder
+from alpasim_plugin.core.files.atomic import atomic_folder, restore_folder, restore_folders
 from alpasim_plugin.core.types import F64, I64, U8
 
 SEQUENCE_FILE = "sequence.json"
@@ -105,6 +105,12 @@ class PairSequence:
         self.info: dict[str, Any] = read_json_object(
             path, do_this="give a folder that 'simrun train pairs' finished"
         )
+        self._file = _identity(path)
+
+    @property
+    def is_current(self) -> bool:
+        """Tell whether its folder is still the one that was read, not one that has replaced it."""
+        return _identity(self.folder / SEQUENCE_FILE) == self._file
 
     @property
     def name(self) -> str:
@@ -141,6 +147,15 @@ class PairSequence:
         return array
 
 
+def _identity(path: Path) -> tuple[int, ...]:
+    """Return what tells a file from one that has taken its place; nothing of one that is not there."""
+    try:
+        state = path.stat()
+    except FileNotFoundError:
+        return ()
+    return state.st_dev, state.st_ino, state.st_mtime_ns
+
+
 @lru_cache(maxsize=OPEN_CLIPS)
 def _opened(sequence: PairSequence) -> PairClip:
     arrays = {name: sequence._open(name) for name in CHANNELS}
@@ -164,6 +179,7 @@ def is_made(folder: Path, info: Mapping[str, Any]) -> bool:
     """Return whether a folder holds a complete sequence that was made in the same way: its
     sequence.json agrees with ``info``.
     """
+    restore_folder(folder)
     path = folder / SEQUENCE_FILE
     if not path.exists():
         return False
@@ -190,8 +206,9 @@ class PairDataset:
         self.refresh()
 
     def refresh(self) -> None:
-        """Find new sequences."""
-        by_name = {s.name: s for s in self.sequences}
+        """Find new sequences, and those that were made again."""
+        by_name = {s.name: s for s in self.sequences if s.is_current}
+        restore_folders(self.folder)
         finished = sorted(
             p.parent
             for p in self.folder.glob(f"*/{SEQUENCE_FILE}")

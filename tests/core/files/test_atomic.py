@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,14 @@ from alpasim_plugin.core.files import atomic
 from alpasim_plugin.core.files.atomic import (
     atomic_file,
     atomic_folder,
+    restore_folders,
     write_array,
     write_bytes,
     write_json,
     write_safetensors,
     write_text,
 )
+from tests.interrupted_folder import kill_between_renames
 
 WRITERS = {
     "bytes": lambda path, n: write_bytes(path, bytes([n]) * 4),
@@ -115,6 +118,7 @@ def test_the_old_folder_returns_if_the_new_one_cannot_be_renamed(tmp_path, monke
     folder = tmp_path / "a"
     folder.mkdir()
     (folder / "x").write_text("old")
+    monkeypatch.setattr(atomic, "_change_places", lambda first, second: False)
     rename, refusals = Path.replace, iter([False, True, False])
 
     def replace(self, target):
@@ -146,30 +150,11 @@ def test_the_folder_of_bytes_is_made_and_a_path_that_cannot_be_is_bad_input(tmp_
         write_bytes(tmp_path / name, b"a")
 
 
-KILLED_BETWEEN = """
-import os, signal, sys
-from pathlib import Path
-from alpasim_plugin.core.files.atomic import atomic_folder
-
-rename = Path.replace
-
-def replace(self, target):
-    rename(self, target)
-    os.kill(os.getpid(), signal.SIGKILL)
-
-Path.replace = replace
-with atomic_folder(Path(sys.argv[1])) as partial:
-    (partial / "x").write_text("new")
-"""
-
-
 def test_a_process_killed_between_the_two_renames_leaves_the_old_folder_to_the_next(tmp_path):
     folder = tmp_path / "a"
     folder.mkdir()
     (folder / "x").write_text("old")
-    words = [sys.executable, "-c", KILLED_BETWEEN, str(folder)]
-    assert subprocess.run(words, check=False).returncode == -9
-    assert not folder.exists()
+    kill_between_renames(folder)
     with pytest.raises(ValueError, match="no"), atomic_folder(folder):  # noqa: PT012 - the block is what fails
         assert (folder / "x").read_text() == "old"
         raise ValueError("no")
@@ -178,6 +163,43 @@ def test_a_process_killed_between_the_two_renames_leaves_the_old_folder_to_the_n
         (partial / "x").write_text("newer")
     assert (folder / "x").read_text() == "newer"
     assert not folder.with_name(".a.simrun-backup").exists()
+
+
+def test_who_lists_folders_finds_those_whose_replacement_was_killed(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    kill_between_renames(tmp_path / "a")
+    restore_folders(tmp_path)
+    assert {path.name for path in tmp_path.iterdir() if path.name[0] != "."} == {"a", "b"}
+
+
+def test_a_reader_meets_the_old_or_the_new_folder_and_never_none(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    if not atomic._change_places(folder, folder):
+        pytest.skip("this file system cannot let two folders change places")
+
+    def replace_often():
+        for number in range(50):
+            with atomic_folder(folder) as partial:
+                (partial / "x").write_text(str(number))
+
+    writer = threading.Thread(target=replace_often)
+    writer.start()
+    while writer.is_alive():
+        assert folder.exists()
+    assert (folder / "x").read_text() == "49"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_link_to_a_folder_is_replaced_and_what_it_leads_to_stays(tmp_path):
+    (tmp_path / "target").mkdir()
+    (tmp_path / "target" / "mine.txt").write_text("mine")
+    (tmp_path / "a").symlink_to("target")
+    with atomic_folder(tmp_path / "a") as partial:
+        (partial / "x").write_text("new")
+    assert (tmp_path / "target" / "mine.txt").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "target"]
 
 
 def test_a_folder_of_a_user_with_a_name_like_a_temporary_one_is_left_alone(tmp_path):

@@ -2,6 +2,7 @@
 learn from.
 """
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from policies.learned import WEIGHTS
 from policies.learned_input import COMMANDS
 from policies.learned_net import LearnedNet, load_net
 from scenarios.load import load_scenario
+from tests.interrupted_folder import kill_between_renames
 from tests.pretended_device import pretended_device, traffic
 
 BARE = ("environment.buildings=0", "environment.trees_per_100m=0", "environment.poles_spacing_m=0")
@@ -55,6 +57,14 @@ def three(scenario, root):
     write_demonstrations(wide, root / "three" / "lead_000", QUICK, 0)
     (demonstrations,) = read_demonstrations(root, "three")
     return demonstrations
+
+
+def test_a_scene_whose_replacement_was_killed_is_still_there(scenario, root, tmp_path):
+    folder = shutil.copytree(root / "train" / "lead_000", tmp_path / "train" / "lead_000")
+    kill_between_renames(folder)
+    assert not write_demonstrations(scenario, folder, QUICK, 0)
+    kill_between_renames(folder)
+    assert [one.folder for one in read_demonstrations(tmp_path, "train")] == [folder]
 
 
 def test_finished_scene_is_kept_and_another_seed_makes_it_anew(scenario, root):

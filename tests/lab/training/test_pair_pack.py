@@ -17,6 +17,7 @@ from alpasim_plugin.lab.training.pair_pack import (
     write_pack,
 )
 from alpasim_plugin.lab.training.pair_store import PairDataset
+from tests.interrupted_folder import kill_between_renames
 from tests.lab.cli.small_training import FEW, SIZES
 from tests.lab.training.pair_files import make
 
@@ -39,6 +40,15 @@ def pack(tmp_path):
     assert facts.psnr_db["rgb_gt"] > 20
     shutil.move(tmp_path / "all", tmp_path / "was")
     return path
+
+
+def test_a_sequence_whose_replacement_was_killed_is_kept(pack, tmp_path):
+    folder = unpack(pack, tmp_path / "new") / "train" / "street_000"
+    (folder / "mine.txt").write_text("mine")
+    kill_between_renames(folder)
+    unpack(pack, tmp_path / "new")
+    assert (folder / "mine.txt").read_text() == "mine"
+    assert not folder.with_name(".street_000.simrun-backup").exists()
 
 
 def test_sequences_come_back_nearly_as_they_were(pack, tmp_path):

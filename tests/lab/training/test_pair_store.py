@@ -8,8 +8,10 @@ from alpasim_plugin.lab.training.pair_store import (
     CHANNELS,
     PairDataset,
     PairSequence,
+    is_made,
     write_sequence,
 )
+from tests.interrupted_folder import kill_between_renames
 from tests.lab.training.pair_files import make, pair
 
 
@@ -49,6 +51,30 @@ def test_dataset_sees_finished_sequences_only_and_new_ones_after_refresh(tmp_pat
     assert dataset.sequences[1].clip is first
     with pytest.raises(InputError):
         PairDataset(tmp_path, "val")
+
+
+@pytest.mark.parametrize("reader", ["dataset", "is made"])
+def test_a_sequence_whose_replacement_was_killed_is_still_there(tmp_path, reader):
+    sequence = make(tmp_path)
+    dataset = PairDataset(tmp_path, "train")
+    kill_between_renames(sequence.folder)
+    if reader == "dataset":
+        dataset.refresh()
+        assert [s.name for s in dataset.sequences] == ["a"]
+        assert len(PairDataset(tmp_path, "train").sequences[0].clip) == 12
+    else:
+        assert is_made(sequence.folder, {"scene_id": "a"})
+        assert not is_made(sequence.folder, {"scene_id": "b"})
+
+
+def test_a_sequence_that_was_made_again_is_the_new_one_after_refresh(tmp_path):
+    make(tmp_path)
+    dataset = PairDataset(tmp_path, "train")
+    assert len(dataset.sequences[0].clip) == 12
+    make(tmp_path, frames=7)
+    dataset.refresh()
+    assert dataset.sequences[0].info["frames"] == 7
+    assert len(dataset.sequences[0].clip) == 7
 
 
 @pytest.mark.parametrize(
