@@ -10,7 +10,7 @@ from pathlib import Path
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import contents, parsing, real
 from alpasim_plugin.core.files.config import Document, load_yaml
-from alpasim_plugin.core.files.inputs import unrecorded
+from alpasim_plugin.core.files.inputs import Inputs, note_files, unrecorded
 from alpasim_plugin.core.interfaces import Source
 from alpasim_plugin.core.parts import PartSpec, build, names, require_installed, resolve
 from scenarios.recorded import RecordedLog
@@ -203,7 +203,8 @@ def recorded_drive(draft: SceneDraft, named: str | None = None) -> RecordedLog:
             "correct the path; it is relative to the scenario file",
         )
     require_installed([kind], document.path, [named])
-    spec, source = _source(kind)
+    spec, source, read_when_made = _source(kind)
+    note_files(read_when_made)
     with parsing(path, "repair this log, or use another one"):
         record = source.read(path, None if log.ego is None else str(log.ego))
         if not isinstance(record, RecordedLog):
@@ -222,8 +223,13 @@ def source_digest(kind: str) -> str | None:
 
 
 @lru_cache(maxsize=16)
-def _source(kind: str) -> tuple[PartSpec, Source]:
-    with unrecorded():  # the code of a source is its digest, and it is remembered here
+def _source(kind: str) -> tuple[PartSpec, Source, dict[str, str]]:
+    """Return a source, made once, with the files that it read when it was imported and made, beside
+    those of its digest.
+    """
+    with unrecorded(), Inputs() as inputs:
         spec = resolve("source", kind)
         source: Source = build(spec)
-    return spec, source
+    of_digest = {str(real(path)) for path in (*spec.code, *spec.files)}
+    read = {path: content for path, content in inputs.files.items() if path not in of_digest}
+    return spec, source, read

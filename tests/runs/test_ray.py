@@ -6,6 +6,8 @@
 import os
 import pickle
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -18,6 +20,7 @@ from scenarios.suite import expand
 from tests.runs.grey_renderer import GREY
 from tests.runs.short_runs import SHORT, Announced, comparable, plan_of
 
+QUICK = ("--renderer", "clean", "--policy", "constant-velocity", "--no-report")
 KILLER = "tests.runs.broken_policies:KillsItsProcess"
 
 
@@ -127,11 +130,20 @@ def test_what_ray_looks_up_itself_is_left_to_it(address):
     ray_backend.require_listening(address)
 
 
-def test_a_dead_cluster_of_the_environment_fails_and_nothing_is_driven_here(tmp_path, monkeypatch):
+def test_a_dead_cluster_of_the_environment_fails_and_nothing_is_driven_here(tmp_path):
+    """In a process of its own: one that is connected to a cluster stays with it."""
     pytest.importorskip("ray", reason="the extra [ray] is not installed")
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(InfrastructureError, match=r"127\.0\.0\.1:1"):
-        drive(plan_of(), tmp_path, Executor("ray"))
+    words = [sys.executable, "-m", "alpasim_plugin.cli.main", "--executor", "ray", *QUICK]
+    environment = os.environ | {"RAY_ADDRESS": "127.0.0.1:1"}
+    done = subprocess.run(
+        [*words, "--out", str(tmp_path), "smoke/straight"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 4
+    assert "127.0.0.1:1" in done.stderr
     assert list(tmp_path.rglob("rollout.asl")) == []
 
 

@@ -13,6 +13,7 @@ from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.log.run_folder.manifests import read_manifest, read_run_json
 from alpasim_plugin.runs.cell import find_rollout_state, kept_failure, run_cell
 from alpasim_plugin.runs.plan import RunOptions, make_plan
+from scenarios.load import load_scenario
 from scenarios.suite import expand
 
 SHORT = ("timing.duration_us=800000",)
@@ -142,3 +143,24 @@ def test_a_policy_that_rewrites_its_state_is_driven_again_each_time_and_it_is_sa
     manifest = next(Path("run").glob("rollouts/*/*/*/*/manifest.json")).parent
     assert read_manifest(manifest).rewritten == (str(state),)
     assert read_json(state) > 2
+
+
+SOURCE = """
+from alpasim_plugin.core.files import read_json
+from tests.core.toy.toy_parts import Csv
+
+SCALE = read_json("{folder}/scale.json")
+
+class Mine(Csv):
+    pass
+"""
+
+
+def test_what_a_source_read_when_it_was_imported_counts_for_every_scene_of_it(tmp_path):
+    (tmp_path / "scale.json").write_text("1")
+    (tmp_path / "source.py").write_text(SOURCE.replace("{folder}", str(tmp_path)))
+    for name in ("first", "second"):
+        log = tmp_path / f"{name}.toycsv"
+        log.write_text("".join(f"{i * 100000},{i},0\n" for i in range(30)))
+        scenario = load_scenario(log, source=f"{tmp_path / 'source.py'}:Mine")
+        assert str(tmp_path / "scale.json") in scenario.files

@@ -133,7 +133,10 @@ class PartSpec:
                 "what the remote part does: it has no digest, and is driven again unless --resume"
             )
         if self.code:
-            return "files that its code opens by itself and does not declare in `files`; installed libraries"
+            return (
+                "files that its code opens by itself and does not declare in `files`; variables of the "
+                "environment; installed libraries"
+            )
         return ""
 
     def __reduce__(self) -> tuple[Any, ...]:
