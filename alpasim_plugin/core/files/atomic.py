@@ -129,7 +129,7 @@ def _change_places(first: Path, second: Path) -> bool:
 
 def _remove(path: Path) -> None:
     """Remove a folder, or a link to one, if it is there."""
-    if path.is_symlink():
+    if os.path.islink(path):
         path.unlink(missing_ok=True)
     else:
         shutil.rmtree(path, ignore_errors=True)
