@@ -419,11 +419,17 @@ def _unforeseen(error: BaseException, command: str) -> SimrunError:
     damaged = damaged_kernels(error)
     if damaged is not None:
         return damaged
-    if isinstance(error, MemoryError):
+    if _lacks_memory(error):
         return InfrastructureError(
-            f"{command}: out of memory: {error}", "Use fewer --workers, or free memory."
+            f"{command}: out of memory or of address space: {error}",
+            "Use fewer --workers, free memory, or raise the limits of `ulimit -a`.",
         )
     if isinstance(error, OSError):
+        if error.errno == errno.EROFS and not error.filename:
+            return InfrastructureError(
+                f"{command}: {error.strerror}, of a file without a name",
+                "Let this user write to /dev/shm, where programs share memory.",
+            )
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return InfrastructureError(
                 f"{command}: {error.strerror}: {error.filename or 'where the output goes'}",
@@ -435,6 +441,21 @@ def _unforeseen(error: BaseException, command: str) -> SimrunError:
                 "Correct the path, or let this user read and write it.",
             )
     return InternalError.of(error, command)
+
+
+def _lacks_memory(error: BaseException) -> bool:
+    """Tell whether the machine, or a limit that it sets, refused memory, a thread or a process; a
+    library that is mapped into too little address space is an `ImportError`.
+    """
+    if isinstance(error, OSError):
+        return error.errno in (errno.ENOMEM, errno.EAGAIN) and not error.filename
+    text = str(error)
+    return (
+        isinstance(error, MemoryError)
+        or (isinstance(error, ImportError) and "failed to map segment" in text)
+        or (isinstance(error, ImportError) and "cannot allocate memory" in text.lower())
+        or (isinstance(error, RuntimeError) and "can't start new thread" in text)
+    )
 
 
 def main() -> None:

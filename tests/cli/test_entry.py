@@ -2,6 +2,7 @@
 signals during imports, a Tab.
 """
 
+import errno
 import json
 import os
 import subprocess
@@ -176,12 +177,33 @@ def test_with_json_it_is_one_document(monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("verb", "found"),
-    [("hungry", "out of memory: of 1 TB"), ("full", "No space left on device: /somewhere/file")],
+    [("hungry", "of address space: of 1 TB"), ("full", "No space left on device: /somewhere/file")],
 )
 def test_too_little_memory_or_disk_is_a_failure_of_the_machine(packages, verb, found):
     done = simrun(packages, verb)
     assert done.returncode == 4
     assert found in two_parts(done.stderr)[0]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("/lib/_compute.so: failed to map segment from shared object"),
+        ImportError("libx.so: cannot allocate memory in static TLS block"),
+        RuntimeError("can't start new thread"),
+        OSError(errno.ENOMEM, "Cannot allocate memory"),
+        OSError(errno.EAGAIN, "Resource temporarily unavailable"),  # of a fork
+        OSError(errno.EROFS, "Read-only file system"),  # of a lock in /dev/shm
+    ],
+    ids=repr,
+)
+def test_what_the_machine_refuses_is_its_failure(monkeypatch, capsys, error):
+    def refused(args: list[str]) -> int:
+        raise error
+
+    monkeypatch.setattr(main, "_run", refused)
+    assert run_command(["list", "renderers"]) == 4
+    assert len(two_parts(capsys.readouterr().err)) == 2
 
 
 @pytest.mark.skipif(

@@ -101,6 +101,9 @@ TABLE_ROWS = Bound(
 )
 TABLE_COLUMNS = Bound("columns of a table", "", 0, 4_096, "each metric has two")
 TABLE_BYTES = Bound("unpacked size of a table", "bytes", 0, 4 * GIB, "it must fit into the memory")
+TABLE_TEXT_BYTES = Bound(
+    "text of a table", "bytes", 0, GIB, "names and messages of a million rollouts take less"
+)
 LOG_BYTES = Bound("size of a rollout log", "bytes", 0, 64 * GIB, "it is read one entry at a time")
 ENTRY_BYTES = Bound(
     "log entry", "bytes", 1, GIB, "a session request with whole maps takes megabytes"

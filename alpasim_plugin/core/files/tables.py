@@ -1,11 +1,19 @@
-"""Parquet tables: rows and bytes by their header, columns by type."""
+"""Parquet tables: rows and bytes by their header, columns by type. Texts are read as codes of a
+dictionary, since a file holds a text once that a million rows repeat; what the rows become in memory
+is counted before they are decoded.
+"""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files.limits import TABLE_BYTES, TABLE_COLUMNS, TABLE_ROWS
+from alpasim_plugin.core.files.limits import (
+    TABLE_BYTES,
+    TABLE_COLUMNS,
+    TABLE_ROWS,
+    TABLE_TEXT_BYTES,
+)
 from alpasim_plugin.core.files.reading import FETCH_AGAIN, check_regular, parsing
 
 NO_PARQUET = "no readable parquet"
@@ -29,10 +37,7 @@ def read_parquet(
         InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
             or of another type.
     """
-    file = _open(path, path, do_this)
-    with parsing(path, do_this, NO_PARQUET):
-        table = file.read()
-        table.validate(full=True)
+    table = _read(path, path, do_this)
     check_columns(table, columns, path, do_this)
     return table
 
@@ -41,11 +46,7 @@ def parse_parquet(data: bytes, location: Path | str, do_this: str = FETCH_AGAIN)
     """Return a parquet document as an Arrow table; see `read_parquet`."""
     import pyarrow as pa
 
-    file = _open(pa.BufferReader(data), location, do_this)
-    with parsing(location, do_this, NO_PARQUET):
-        table = file.read()
-        table.validate(full=True)
-    return table
+    return _read(pa.BufferReader(data), location, do_this)
 
 
 def check_parquet(
@@ -54,14 +55,55 @@ def check_parquet(
     """Check the header of a parquet file that is read in parts later, and return its columns; see
     `read_parquet` for what is refused.
     """
-    empty = _open(path, path, do_this).schema_arrow.empty_table()
+    _, schema = _open(path, path, do_this)
+    empty = schema.empty_table()
     check_columns(empty, columns, path, do_this)
     return list(empty.column_names)
 
 
-def _open(source: Any, location: Path | str, do_this: str) -> Any:
+def _read(source: Any, location: Path | str, do_this: str) -> Any:
+    """Return a parquet file as a table of the types that it states."""
+    file, schema = _open(source, location, do_this)
+    with parsing(location, do_this, NO_PARQUET):
+        table = file.read()
+        table.validate(full=True)
+        check_text(table, location)
+        return table.cast(schema)
+
+
+def check_text(table: Any, location: Path | str) -> None:
+    """Refuse a table whose texts, which it holds once for all rows that repeat them, take more than
+    the bound where each row has its own.
+
+    Raises:
+        InputError: They do.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    size = 0
+    for column in table.columns:
+        for chunk in column.chunks if pa.types.is_dictionary(column.type) else ():
+            if is_text(chunk.dictionary.type):
+                lengths = pc.binary_length(chunk.dictionary)
+                size += pc.sum(pc.take(lengths, chunk.indices)).as_py() or 0
+    TABLE_TEXT_BYTES.check(size, location)
+
+
+def is_text(type_: Any) -> bool:
+    """Tell whether an Arrow type holds text or bytes of any length."""
+    import pyarrow.types as t
+
+    tests = (t.is_string, t.is_large_string, t.is_binary, t.is_large_binary)
+    return any(test(type_) for test in tests)
+
+
+def _open(source: Any, location: Path | str, do_this: str) -> tuple[Any, Any]:
     """Open a parquet file; refuse more rows, columns or unpacked bytes than the bounds, by its
     header.
+
+    Returns:
+        The file, which reads texts as codes of a dictionary, and the schema that it states.
     """
     import pyarrow.parquet as pq
 
@@ -72,14 +114,38 @@ def _open(source: Any, location: Path | str, do_this: str) -> Any:
         facts = file.metadata
         TABLE_ROWS.check(facts.num_rows, location)
         TABLE_COLUMNS.check(facts.num_columns, location)
-        size = 0
-        for i in range(facts.num_row_groups):
-            for j in range(facts.num_columns):
-                chunk = facts.row_group(i).column(j)
-                # Runs of equal values take no space in the file: what they become in memory counts.
-                size += max(chunk.total_uncompressed_size, 8 * chunk.num_values)
-        TABLE_BYTES.check(size, location)
-    return file
+        schema = file.schema_arrow
+        texts = [field.name for field in schema if is_text(field.type)]
+        sizes = [
+            _size_in_memory(facts, i, j, texts)
+            for i in range(facts.num_row_groups)
+            for j in range(facts.num_columns)
+        ]
+        TABLE_BYTES.check(sum(sizes), location)
+        if texts:
+            file = pq.ParquetFile(
+                source, metadata=facts, read_dictionary=texts, page_checksum_verification=True
+            )
+    return file, schema
+
+
+def _size_in_memory(facts: Any, group: int, column: int, texts: Collection[str]) -> int:
+    """Return at least how many bytes a column of a group of rows takes in memory: runs of equal
+    values take no space in the file. Of texts that are decoded at once, it is the most.
+
+    Args:
+        facts: Metadata of the file.
+        group: Number of the group.
+        column: Number of the column.
+        texts: Paths of the columns that are read as codes.
+    """
+    chunk = facts.row_group(group).column(column)
+    value_bytes = 8
+    if chunk.physical_type == "FIXED_LEN_BYTE_ARRAY":
+        value_bytes = max(facts.schema.column(column).length, value_bytes)
+    elif chunk.physical_type == "BYTE_ARRAY" and chunk.path_in_schema not in texts:
+        value_bytes = max(chunk.total_uncompressed_size, value_bytes)  # one text for all values
+    return int(max(chunk.total_uncompressed_size, value_bytes * chunk.num_values))
 
 
 def check_columns(

@@ -155,6 +155,27 @@ def test_runs_of_equal_values_count_as_what_they_become(tmp_path, monkeypatch):
     assert "unpacked size" in refused(lambda: read_parquet(tmp_path / "t.parquet", {}))
 
 
+@pytest.mark.parametrize("kind", [pa.string(), pa.large_string(), pa.binary()])
+def test_a_text_that_many_rows_repeat_counts_for_each_of_them(tmp_path, monkeypatch, kind):
+    path = tmp_path / "t.parquet"
+    table = pa.table({"a": pa.array(["x" * 10_000] * 1000 + [None, ""]).cast(kind)})
+    pq.write_table(table, path)
+    assert path.stat().st_size < 30_000
+    assert read_parquet(path, {}).equals(table)
+    monkeypatch.setattr(tables, "TABLE_TEXT_BYTES", replace(tables.TABLE_TEXT_BYTES, high=9e6))
+    assert "text of a table" in refused(lambda: read_parquet(path, {}))
+
+
+@pytest.mark.parametrize(
+    "column",
+    [pa.array([["x" * 10_000]] * 1000), pa.array([b"x" * 10_000] * 1000, pa.binary(10_000))],
+)
+def test_values_of_any_length_count_for_each_row(tmp_path, monkeypatch, column):
+    pq.write_table(pa.table({"a": column}), tmp_path / "t.parquet")
+    monkeypatch.setattr(tables, "TABLE_BYTES", replace(tables.TABLE_BYTES, high=9e6))
+    assert "unpacked size" in refused(lambda: read_parquet(tmp_path / "t.parquet", {}))
+
+
 @pytest.mark.parametrize(
     "text",
     [
