@@ -2,8 +2,6 @@
 
 import ast
 
-import pytest
-
 from tests.source_modules import modules
 
 PRONOUNS = frozenset(
@@ -41,8 +39,6 @@ CONTRACT = {
     "alpasim_plugin.lab.training.model_card": {"what"},
     "alpasim_plugin.lab.training.photograph_pairs": {"every"},
 }
-# The room that still has some, and how many: none may come.
-UNREAD = {"evaluators.statistics": 32}
 
 
 def of_short_comprehensions(tree_nodes):
@@ -79,20 +75,7 @@ def pronouns(module):
 
 
 def test_names_are_no_pronouns_or_participles():
-    unread = tuple(f"{room}." for room in UNREAD)
-    rooms = [module for module in modules() if not f"{module.name}.".startswith(unread)]
-    assert [line for module in rooms for line in pronouns(module)] == []
-
-
-@pytest.mark.parametrize("room", UNREAD)
-def test_no_pronoun_comes_to_a_room_that_still_has_some(room):
-    lines = [
-        line
-        for module in modules()
-        if f"{module.name}.".startswith(f"{room}.")
-        for line in pronouns(module)
-    ]
-    assert len(lines) <= UNREAD[room], lines
+    assert [line for module in modules() for line in pronouns(module)] == []
 
 
 def test_every_name_that_is_excepted_is_bound():

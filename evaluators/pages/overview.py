@@ -400,13 +400,13 @@ def _with_shipped_scenes(run: Run, rows: Sequence[VariantRow]) -> str:
     open; empty where they are not, or where the run is not about them.
     """
     is_shipped = all(name.startswith("suites/") for name in run.info.asked or ("",))
-    open_rows = [row for row in rows if row.difference is not None and row.difference.fewest]
-    enough = [row for row in open_rows if are_shipped(row.difference.fewest)]
-    if not is_shipped or not enough or len(run.policies) > 1:
+    names: dict[str, None] = {}  # in order, once each
+    for row in rows:
+        difference = row.difference
+        if difference is not None and difference.fewest and are_shipped(difference.fewest):
+            names |= dict.fromkeys((difference.baseline, row.key))
+    if not is_shipped or not names or len(run.policies) > 1:
         return ""
-    names = dict.fromkeys(
-        name for row in enough if row.difference for name in (row.difference.baseline, row.key)
-    )
     return f"; {shipped_text(list(names), run.policies)}"
 
 

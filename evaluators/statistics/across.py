@@ -99,15 +99,15 @@ def compare_runs(
         InputError: The runs differ in preset or in a scene's content, share no scene, a renderer or
             policy has no partner, or a metric is another quantity in the other run.
     """
-    both = f"{first.folder} and {second.folder}"
+    folders = f"{first.folder} and {second.folder}"
     presets = [run.summary.preset for run in (first, second)]
     if presets[0] != presets[1]:
         raise InputError(
-            f"{both}: presets {presets[0]!r} and {presets[1]!r}",
+            f"{folders}: presets {presets[0]!r} and {presets[1]!r}",
             "give the command of one run again with --preset",
         )
     check_scenes(
-        scene_hashes(first), scene_hashes(second), both, "run both on the same scene files"
+        scene_hashes(first), scene_hashes(second), folders, "run both on the same scene files"
     )
     table = table_of_run(second)
     base = table_of_run(first)
@@ -152,6 +152,6 @@ def compare_runs(
         raise InputError(
             f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
         )
-    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, both)
+    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, folders)
     tables = compare_pairs(table, {BLOCKS[0]: pairs}, metrics, base, listed)
     return Comparison(tables[BLOCKS[0]], notes=notes, metrics=metrics)

@@ -149,12 +149,14 @@ class GateSpec(_Strict):
         return self
 
 
-def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[GateSpec, str]:
+def load_gate(
+    path_or_name: str | Path, metric_table: MetricTable = METRICS
+) -> tuple[GateSpec, str]:
     """Read a gate file, or a shipped gate by name (``default``).
 
     Args:
         path_or_name: The file or the name.
-        known: The metrics that it may name: those of the run that it decides about.
+        metric_table: The metrics that it may name: those of the run that it decides about.
 
     Returns:
         The gate and the file it came from.
@@ -175,12 +177,12 @@ def load_gate(path_or_name: str | Path, known: MetricTable = METRICS) -> tuple[G
     spec = validate(GateSpec, document)
     for name, rule in spec.metrics.items():
         try:
-            facts = known.info(name)
+            facts = metric_table.info(name)
         except (EvaluatorError, InputError) as error:
             raise document.error(
                 ("metrics", name),
                 f"no metric {name!r}",
-                f"{guess(name, known)}simrun list metrics prints the known ones",
+                f"{guess(name, metric_table)}simrun list metrics prints the known ones",
             ) from error
         if rule.margin == 0.0 and facts.direction == "none":
             problem = f"a margin of 0 for {name!r}, which has no better side"
@@ -274,7 +276,7 @@ def check_gate(
     spec: GateSpec,
     stored: RolloutTable | None = None,
     stored_name: str = "",
-    known: MetricTable = METRICS,
+    metric_table: MetricTable = METRICS,
     preset: str = DEFAULT,
     repeatable: bool | None = None,
 ) -> GateVerdict:
@@ -285,7 +287,7 @@ def check_gate(
         spec: The gate.
         stored: A stored baseline; without it the baseline is a renderer of the run itself.
         stored_name: How to call the stored baseline.
-        known: What the metrics are.
+        metric_table: What the metrics are.
         preset: With which both sides were scored.
         repeatable: What ``run --repeat`` found; False if either side's policy is not; None: not
             tried, and taken as repeatable.
@@ -325,14 +327,16 @@ def check_gate(
                 against += f" of {stored_name or 'the baseline'}"
             pair = _Pair(variant, name_in_text, side, other_side, label, against)
             if spec.population == "scenes":
-                checks += _of_scenes(pair, spec, known)
+                checks += _of_scenes(pair, spec, metric_table)
             else:
                 checks += _of_suite(
-                    pair, spec, known, find_preset(preset).stop_after, repeatable is False
+                    pair, spec, metric_table, find_preset(preset).stop_after, repeatable is False
                 )
         for name, rule in spec.metrics.items():
             if rule.max is not None or rule.min is not None:
-                checks.append(_limit(side, variant, name_in_text, known.info(name), rule, spec))
+                checks.append(
+                    _limit(side, variant, name_in_text, metric_table.info(name), rule, spec)
+                )
     failures = failures_of(rollouts)
     outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
     of_failures = outcome_of_failures(failures, spec.max_failed)
@@ -345,14 +349,14 @@ def check_gate(
         name = f"{kind}{base.name} of the same run"
     about = SCENES if spec.population == "scenes" else SUITE[repeatable]
     accepts_failures = failures.n_failed > 0 and of_failures.cause == "pass"
-    sizes = _sizes(checks, spec, known, is_noisy=repeatable is False)
+    sizes = _sizes(checks, spec, metric_table, is_noisy=repeatable is False)
     return GateVerdict(
         worst(outcomes), tuple(checks), failures, name, about, sizes, accepts_failures
     )
 
 
 def _sizes(
-    checks: Sequence[Check], spec: GateSpec, known: MetricTable, is_noisy: bool
+    checks: Sequence[Check], spec: GateSpec, metric_table: MetricTable, is_noisy: bool
 ) -> tuple[str, ...]:
     """Say what as many pairs or scenes as were compared can show about events, once for each number:
     variants may have different ones, and rules may accept different numbers of new events. Limits
@@ -370,7 +374,7 @@ def _sizes(
     accepted = {
         rule.new_of(spec.max_new)
         for name, rule in spec.metrics.items()
-        if rule.is_paired and known.info(name).is_flag
+        if rule.is_paired and metric_table.info(name).is_flag
     }
     needed = {n_new + 1 for n_new in accepted or {spec.max_new}}
     if is_noisy:
@@ -396,12 +400,12 @@ def failures_of(table: RolloutTable) -> Failures:
 def _tested_variants(
     variants: list[Variant], spec: GateSpec, base: Base | None, is_paired: bool
 ) -> list[Variant]:
-    known = {variant.renderer for variant in variants}
-    absent = [name for name in spec.renderers if name not in known]
+    renderers = {variant.renderer for variant in variants}
+    absent = [name for name in spec.renderers if name not in renderers]
     if absent:
         raise InputError(
             f"renderers {absent}: the run has none of these",
-            f"it has {', '.join(sorted(known))}",
+            f"it has {', '.join(sorted(renderers))}",
         )
     if spec.renderers:
         return [variant for variant in variants if variant.renderer in spec.renderers]
@@ -473,20 +477,22 @@ class _Pair:
         return Check(renderer, policy, metric.name, "margin", cause, sentence, entry, binding)
 
 
-def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
+def _of_scenes(pair: _Pair, spec: GateSpec, metric_table: MetricTable) -> list[Check]:
     """Test what others of the population may show.
 
     Raises:
         InputError: There are too few scenes for any answer that passes.
     """
     check_number_of_scenes(
-        spec, len({scene for _, scene, _ in set(pair.side.cells) & set(pair.base.cells)}), known
+        spec,
+        len({scene for _, scene, _ in set(pair.side.cells) & set(pair.base.cells)}),
+        metric_table,
     )
     checks = []
     for name, rule in spec.metrics.items():
         if not rule.is_paired:
             continue
-        metric = known.info(name)
+        metric = metric_table.info(name)
         margin = rule.margin_of(metric)
         entry = compare(pair.side, pair.base, metric, pair.label, margin)
         cause = CAUSES[entry.verdict]
@@ -500,7 +506,9 @@ def _of_scenes(pair: _Pair, spec: GateSpec, known: MetricTable) -> list[Check]:
     return checks
 
 
-def check_number_of_scenes(spec: GateSpec, n_scenes: int, known: MetricTable = METRICS) -> None:
+def check_number_of_scenes(
+    spec: GateSpec, n_scenes: int, metric_table: MetricTable = METRICS
+) -> None:
     """Refuse a number of scenes with which a gate cannot pass, whatever they show.
 
     Raises:
@@ -516,7 +524,7 @@ def check_number_of_scenes(spec: GateSpec, n_scenes: int, known: MetricTable = M
     for name, rule in spec.metrics.items():
         if not rule.is_paired or not rule.must_decide:
             continue
-        metric = known.info(name)
+        metric = metric_table.info(name)
         margin = rule.margin_of(metric)
         least = least_scenes(metric, margin) if margin else None
         if least is None or n_scenes < least:
@@ -528,7 +536,7 @@ def check_number_of_scenes(spec: GateSpec, n_scenes: int, known: MetricTable = M
 
 
 def _of_suite(
-    pair: _Pair, spec: GateSpec, known: MetricTable, stops: Sequence[str], is_noisy: bool
+    pair: _Pair, spec: GateSpec, metric_table: MetricTable, stops: Sequence[str], is_noisy: bool
 ) -> list[Check]:
     """Say what changed in these scenes; an event that ends the scored part counts although the gate
     does not name it, since nothing after it was scored.
@@ -537,7 +545,7 @@ def _of_suite(
     unnamed = [stop for stop in stops if stop not in rules]
     changes = []
     for name in (*rules, *unnamed):
-        metric = known.info(name)
+        metric = metric_table.info(name)
         accepted = rules[name].margin_of(metric) if name in rules else metric.accepted
         changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
     is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
@@ -635,11 +643,11 @@ def _limit(
     """
     values = side.values(metric.name)
     is_valid = np.isfinite(values)
-    known = values[is_valid]
+    valid_values = values[is_valid]
     n_ran = int(np.sum(ran(side)))
     n_missing = int(np.sum(ran(side) & ~is_valid))
     n_scenes = len(set(side.scene[is_valid].tolist()))
-    mean = float(known.mean()) if len(known) else None
+    mean = float(valid_values.mean()) if len(valid_values) else None
     cause: Cause = "incomplete"
     if mean is not None:
         is_above = rule.max is not None and mean > rule.max
@@ -647,17 +655,22 @@ def _limit(
         cause = "regression" if is_above or is_below else "pass"
     bounds = {"max": rule.max, "min": rule.min}
     limits = " and ".join(f"{kind} {end:g}" for kind, end in bounds.items() if end is not None)
-    found = "no valid value" if mean is None else short(mean, metric.unit)
-    text = f"{name}: {metric.name} {found}, limit {limits}"
+    mean_text = "no valid value" if mean is None else short(mean, metric.unit)
+    text = f"{name}: {metric.name} {mean_text}, limit {limits}"
     is_missing = n_missing > spec.max_missing * n_ran
     if is_missing:
         cause = "incomplete"
-        text += f"; valid in {len(known)} of {plural(n_ran, 'rollout')}"
+        text += f"; valid in {len(valid_values)} of {plural(n_ran, 'rollout')}"
     if n_scenes < spec.min_scenes:
         cause = "incomplete"
         text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
-    worst_places = np.argsort(values if rule.max is None else -values)[: len(known)].tolist()
-    entry: JsonObject = {"mean": mean, **bounds, "n_rollouts": len(known), "n_missing": n_missing}
+    worst_places = np.argsort(values if rule.max is None else -values)[: len(valid_values)].tolist()
+    entry: JsonObject = {
+        "mean": mean,
+        **bounds,
+        "n_rollouts": len(valid_values),
+        "n_missing": n_missing,
+    }
     entry["worst"] = [
         {"scene": side.cells[i][1], "seed": side.cells[i][2], "was": None, "now": values[i]}
         for i in worst_places[:LISTED]

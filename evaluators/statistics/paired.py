@@ -341,9 +341,8 @@ def decide(
         p_corrected=p_corrected,
         difference=difference(entry.diff, p_corrected, metric.direction),
     )
-    if entry.difference is None and entry.spread is not None and metric.direction != "none":
-        needed = scenes_to_differ(entry.diff, entry.spread, n_tests)
-        entry = replace(entry, more_scenes_to_differ=more_than(needed, entry.n_scenes))
+    if entry.difference is None and metric.direction != "none":
+        entry = replace(entry, more_scenes_to_differ=_more_to_differ(entry, n_tests))
     if entry.ci95 is None:
         return entry
     answer, reasons = _verdict_about_others(entry, metric, p_corrected)
@@ -383,6 +382,13 @@ def _unguarded_bounds(entry: Difference, metric: MetricInfo) -> Bounds | None:
         return None
     half = t_half_width(entry.spread, entry.n_scenes)
     return entry.cut_mean - half, entry.cut_mean + half
+
+
+def _more_to_differ(entry: Difference, n_tests: int) -> int | None:
+    """Return how many more scenes would show a difference; None where none would."""
+    if entry.diff is None or entry.spread is None:
+        return None
+    return more_than(scenes_to_differ(entry.diff, entry.spread, n_tests), entry.n_scenes)
 
 
 def _more_scenes(entry: Difference, metric: MetricInfo, n_tests: int) -> int | None:

@@ -87,10 +87,12 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
             # 1 where any is known to be 1, unknown where none is and one is unknown.
             flags = [table[part] for part in parts]
             fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in flags], axis=0)
-            known = fired | np.all([part.valid for part in flags], axis=0)
-            value = np.where(known, fired.astype(np.float64), np.nan)
-            reason = "" if bool(known.all()) else next(part.reason for part in flags if part.reason)
-            table[name] = MetricSeries(METRICS[name], flags[0].t_us, value, known, reason)
+            is_valid = fired | np.all([part.valid for part in flags], axis=0)
+            value = np.where(is_valid, fired.astype(np.float64), np.nan)
+            reason = (
+                "" if bool(is_valid.all()) else next(part.reason for part in flags if part.reason)
+            )
+            table[name] = MetricSeries(METRICS[name], flags[0].t_us, value, is_valid, reason)
     first_us, last_us, ledger = _window(table, chosen)
     # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have
     # it.
@@ -196,9 +198,9 @@ def _reduce(
             if valid[-1]
             else _value(metric_series.metric, None, metric_series.reason)
         )
-    known = value[valid]
-    fired = bool(np.any(known > 0))
-    if not len(known) or (
+    valid_values = value[valid]
+    fired = bool(np.any(valid_values > 0))
+    if not len(valid_values) or (
         metric_series.metric.is_flag
         and metric_series.metric.aggregation == "max"
         and not fired
@@ -209,7 +211,7 @@ def _reduce(
         return _value(metric_series.metric, None, metric_series.reason)
     return _value(
         metric_series.metric,
-        _REDUCE[metric_series.metric.aggregation](known, metric_series.t_us[rows][valid]),
+        _REDUCE[metric_series.metric.aggregation](valid_values, metric_series.t_us[rows][valid]),
     )
 
 

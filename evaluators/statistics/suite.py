@@ -282,11 +282,11 @@ def flipped(rows: F64) -> F64:
     norms = np.sqrt(np.sum(changed**2, axis=1))
     is_used = norms > 0.0
     scaled = changed[is_used] / norms[is_used, None]
-    seen = scaled.sum(axis=1)
+    observed = scaled.sum(axis=1)
     out = np.ones(len(rows))
     if is_used.any():
         sums, first = flipped_sums(scaled)
-        reached = np.sum(np.max(sums, axis=1)[:, None] >= seen - ROUNDING, axis=0)
+        reached = np.sum(np.max(sums, axis=1)[:, None] >= observed - ROUNDING, axis=0)
         out[is_used] = (first + reached) / (first + len(sums))
     return out
 
@@ -334,5 +334,5 @@ def seeds_that_decide(change: Change) -> int | None:
     if not all(drives.is_answered for drives in change.far_drives):
         return None
     needed = [seeds_for_mean(harms, change.margin, n_scenes) for harms in change.of_cells]
-    known = [seeds for seeds in needed if seeds is not None]
-    return max(known) if len(known) == len(needed) else None
+    numbers = [seeds for seeds in needed if seeds is not None]
+    return max(numbers) if len(numbers) == len(needed) else None

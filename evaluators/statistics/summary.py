@@ -40,7 +40,7 @@ from evaluators.statistics.intervals import (
 from evaluators.statistics.paired import compare_pairs, pairs_within
 
 
-def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> MeanTable:
+def aggregate(rows: Sequence[Row], metric_table: MetricTable = METRICS) -> MeanTable:
     """Average rollouts per renderer and metric, with the paper's and the scene-clustered 95 %
     interval.
 
@@ -48,28 +48,28 @@ def aggregate(rows: Sequence[Row], known: MetricTable = METRICS) -> MeanTable:
         rows: One mapping per rollout with ``renderer``, ``policy``, ``scene``, ``seed``, ``status``
             and the metrics, either flat (``METRIC``, ``METRIC_valid``) or under ``metrics``. Rows
             whose status is not "ok" and invalid values do not enter.
-        known: What the metrics are.
+        metric_table: What the metrics are.
 
     Returns:
         RENDERER -> METRIC -> mean.
     """
     flat_rows = [flat_row(row) for row in rows]
-    return aggregate_sides(by_renderer(flat_rows), metric_names(flat_rows), known)
+    return aggregate_sides(by_renderer(flat_rows), metric_names(flat_rows), metric_table)
 
 
 def aggregate_sides(
-    sides: Mapping[str, Side], metrics: Sequence[str], known: MetricTable
+    sides: Mapping[str, Side], metrics: Sequence[str], metric_table: MetricTable
 ) -> MeanTable:
     """Average rollouts per renderer and metric; see `aggregate`.
 
     Args:
         sides: RENDERER -> its rollouts.
         metrics: Which metrics.
-        known: What they are.
+        metric_table: What they are.
     """
     # Metric by metric: renderers share its column and its draws.
     entries = {
-        name: {renderer: _mean(side, known.info(name)) for renderer, side in sides.items()}
+        name: {renderer: _mean(side, metric_table.info(name)) for renderer, side in sides.items()}
         for name in metrics
     }
     return {renderer: {name: entries[name][renderer] for name in metrics} for renderer in sides}
@@ -131,12 +131,14 @@ NOTHING_SCORED = Ledger(0, 0, 0, 0, 0, "")
 FIXER_GUARD = "fixer-"  # frame events of this kind: the fixer's frame was replaced by the raw one
 
 
-def censoring(manifests: Sequence[Manifest], known: MetricTable = METRICS) -> dict[str, Censoring]:
+def censoring(
+    manifests: Sequence[Manifest], metric_table: MetricTable = METRICS
+) -> dict[str, Censoring]:
     """Count what did not enter the table, per renderer and cause.
 
     Args:
         manifests: Of all rollouts.
-        known: What the metrics are.
+        metric_table: What the metrics are.
 
     Returns:
         RENDERER -> what was removed, and the bounds of rates that this allows.
@@ -146,13 +148,13 @@ def censoring(manifests: Sequence[Manifest], known: MetricTable = METRICS) -> di
     for manifest in manifests:
         by_name.setdefault(manifest.renderer, []).append(manifest)
     return {
-        renderer: _of_renderer(of_renderer, names, known)
+        renderer: _of_renderer(of_renderer, names, metric_table)
         for renderer, of_renderer in by_name.items()
     }
 
 
 def _of_renderer(
-    manifests: Sequence[Manifest], names: Sequence[str], known: MetricTable
+    manifests: Sequence[Manifest], names: Sequence[str], metric_table: MetricTable
 ) -> Censoring:
     side = Side.of([RolloutValues.of_manifest(manifest) for manifest in manifests])
     finished = [manifest for manifest in manifests if manifest.ok]
@@ -161,9 +163,9 @@ def _of_renderer(
     for manifest in finished:
         events.update(manifest.frame_events)
     rates = {
-        name: _rate_limits(manifests, side, known.info(name))
+        name: _rate_limits(manifests, side, metric_table.info(name))
         for name in names
-        if known.info(name).is_flag
+        if metric_table.info(name).is_flag
     }
     return Censoring(
         rollouts=len(manifests),
@@ -217,11 +219,11 @@ def _rate_limits(manifests: Sequence[Manifest], side: Side, metric: MetricInfo) 
         values, cut, scored, is_share=metric.aggregation == "mean"
     )
     scenes = side.scene[side.cell]
-    none, every = (
+    lowest, highest = (
         rate_interval(cluster_means(np.nan_to_num(values, nan=fill), scenes)[0])
         for fill in (0.0, 1.0)
     )
-    return RateLimits(over_steps, over_rollouts, (none.low, every.high), n_cut)
+    return RateLimits(over_steps, over_rollouts, (lowest.low, highest.high), n_cut)
 
 
 def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[Bounds, Bounds, int]:
@@ -237,21 +239,21 @@ def rate_bounds(values: F64, cut: F64, scored: F64, is_share: bool) -> tuple[Bou
         Bounds over missing rollouts; bounds over missing rollouts and cut steps; how many rollouts
         were cut before the event was seen.
     """
-    known = np.isfinite(values)
-    seen = values[known]
+    is_valid = np.isfinite(values)
+    valid_values = values[is_valid]
     n = len(values)
-    missing = int(np.sum(~known))
-    cut = cut[known]
-    scored = scored[known]
-    least = seen
-    greatest = np.where(cut > 0, 1.0, seen)
+    missing = int(np.sum(~is_valid))
+    cut = cut[is_valid]
+    scored = scored[is_valid]
+    least = valid_values
+    greatest = np.where(cut > 0, 1.0, valid_values)
     if is_share:
         steps = np.maximum(scored + cut, 1.0)
-        least = np.where(cut > 0, seen * scored / steps, seen)
-        greatest = np.where(cut > 0, (seen * scored + cut) / steps, seen)
-    over_rollouts = (float(seen.sum()) / n, (float(seen.sum()) + missing) / n)
+        least = np.where(cut > 0, valid_values * scored / steps, valid_values)
+        greatest = np.where(cut > 0, (valid_values * scored + cut) / steps, valid_values)
+    over_rollouts = (float(valid_values.sum()) / n, (float(valid_values.sum()) + missing) / n)
     over_steps = (float(least.sum()) / n, (float(greatest.sum()) + missing) / n)
-    return over_rollouts, over_steps, int(np.sum(greatest > seen))
+    return over_rollouts, over_steps, int(np.sum(greatest > valid_values))
 
 
 NO_BASES: Mapping[str, str] = {}
@@ -273,7 +275,7 @@ def numbers(
     table: RolloutTable,
     baseline: str | None = None,
     bases: Mapping[str, str] = NO_BASES,
-    known: MetricTable = METRICS,
+    metric_table: MetricTable = METRICS,
 ) -> Numbers:
     """Return the means and the paired differences of a run (docs/statistics.md).
 
@@ -283,13 +285,13 @@ def numbers(
             does not name, or a policy did not meet, is the first of its kind.
         bases: Renderer with a fixer -> the renderer below it; where both were driven and it is not
             the baseline, the two are paired too.
-        known: What the metrics are.
+        metric_table: What the metrics are.
     """
     metrics = {
-        policy: aggregate_sides(table.sides(policy), table.metrics, known)
+        policy: aggregate_sides(table.sides(policy), table.metrics, metric_table)
         for policy in table.policies
     }
-    blocks = compare_pairs(table, pairs_within(table, baseline, bases), known)
+    blocks = compare_pairs(table, pairs_within(table, baseline, bases), metric_table)
     return Numbers(metrics=by_policy(metrics), **blocks)
 
 

@@ -140,7 +140,9 @@ def undecided(table):
     open_again = {"p_corrected": None, "verdict": "undecided", "difference": None}
     return {
         variant: {
-            name: replace(entry, **open_again, more_scenes=None, note=None)
+            name: replace(
+                entry, **open_again, more_scenes=None, more_scenes_to_differ=None, note=None
+            )
             for name, entry in entries.items()
         }
         for variant, entries in table.items()
