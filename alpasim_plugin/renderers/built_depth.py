@@ -5,11 +5,12 @@ ground. Lamps, snow and air are of the scene, so they are placed by the scene it
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 
 from alpasim_plugin.core.types import F32, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.scene_graph import SceneView
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.rolling import draw_requests
 
@@ -39,5 +40,10 @@ class BuiltDepth:
 
     def _draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:
         """Draw the views' surfaces."""
-        outs = scene_of(self.scenario).render_all(views, self.threads, self.device)
+        outs = self._scene.render_all(views, self.threads, self.device)
         return [out.surface() for out in outs]
+
+    @cached_property
+    def _scene(self) -> SceneGraph:
+        """Kept, because a scene is known by its whole content, which takes as long as a drawing."""
+        return scene_of(self.scenario)

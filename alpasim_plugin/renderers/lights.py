@@ -7,6 +7,7 @@ shadow. What is seen of it is a spot of one colour, which depth hides.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -148,26 +149,57 @@ def _street_lux(from_lamp: F64) -> F64:
     return STREET_CD * np.maximum(-from_lamp[:, 2], 0) / np.maximum(distance, 0.1) ** 3
 
 
+class Rectangle(NamedTuple):
+    """Where a spot shows in an image: two corners, ``(x, y)`` in sixteenths of pixels from the middle
+    of the first one, and metres along the optical axis.
+    """
+
+    spot: Spot
+    low: list[int]
+    high: list[int]
+    depth_m: float
+
+
+def in_image(
+    spots: Sequence[Spot], K: F64, T_world_camera: F64, shape: tuple[int, int]
+) -> list[Rectangle]:
+    """Return the upright rectangles that spots are in an image, the farthest first.
+
+    Args:
+        spots: In any order.
+        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        T_world_camera: ``(4, 4)`` its pose.
+        shape: Height and width, pixels.
+    """
+    offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - T_world_camera[:3, 3]
+    local = offsets @ T_world_camera[:3, :3]
+    distance = np.linalg.norm(offsets, axis=1)
+    end = 16 * np.array(shape[::-1])
+    rectangles = []
+    for i in np.argsort(-distance, kind="stable"):
+        spot = spots[i]
+        depth_m = float(local[i, 2])
+        facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
+        if depth_m < NEAREST_M or distance[i] > SIGHT_M or facing <= 0:
+            continue
+        centre = (K @ local[i] / depth_m)[:2] - 0.5
+        half = K[0, 0] * spot.half_m / depth_m * np.array([facing, 1.0])
+        low, high = (np.rint(16 * (centre + side * half)).astype(int) for side in (-1, 1))
+        if (high >= -16).all() and (low <= end).all():  # a pixel more, however corners are rounded
+            rectangles.append(Rectangle(spot, low.tolist(), high.tolist(), depth_m))
+    return rectangles
+
+
 def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
     """Draw spots as upright rectangles, the nearest on top.
 
     Returns:
         Their colours ``(H, W, 3)``, and their depths ``(H, W)``, infinite where there is none.
     """
-    light = np.zeros(view.rays.shape, dtype=np.float32)
-    front = np.full(view.depth_m.shape, np.inf, dtype=np.float32)
-    offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - view.place
-    local = offsets @ view.T_world_camera[:3, :3]
-    distance = np.linalg.norm(offsets, axis=1)
-    for i in np.argsort(-distance, kind="stable"):
-        spot = spots[i]
-        depth = float(local[i, 2])
-        facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
-        if depth < NEAREST_M or distance[i] > SIGHT_M or facing <= 0:
-            continue
-        centre = (view.K @ local[i] / depth)[:2] - 0.5
-        half = view.K[0, 0] * spot.half_m / depth * np.array([facing, 1.0])
-        low, high = (np.rint(16 * (centre + side * half)).astype(int).tolist() for side in (-1, 1))
+    height, width = view.depth_m.shape
+    light = np.zeros((height, width, 3), dtype=np.float32)
+    front = np.full((height, width), np.inf, dtype=np.float32)
+    for spot, low, high, depth_m in in_image(spots, view.K, view.T_world_camera, (height, width)):
         cv2.rectangle(light, low, high, spot.rgb, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
-        cv2.rectangle(front, low, high, depth, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
+        cv2.rectangle(front, low, high, depth_m, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
     return light, front

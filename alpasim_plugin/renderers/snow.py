@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F32, Scenario
+from alpasim_plugin.core.types import F32, F64, Scenario
 from alpasim_plugin.renderers.view import View
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.path import polyline_path
@@ -47,21 +47,30 @@ class SnowCover:
         depth_m = local[..., 2]
         is_seen = (depth_m.max(axis=1) > NEAREST_M) & (depth_m.min(axis=1) < SIGHT_M)
         cover: F32 = np.full(view.ground.shape, BESIDE, dtype=np.float32)
-        for quad, share in zip(local[is_seen], self.shares[is_seen].tolist(), strict=True):
-            # It is cut at the plane `NEAREST_M` before the camera.
-            following = np.roll(quad, -1, axis=0)
-            is_front = quad[:, 2] > NEAREST_M
-            kept = []
-            for first, second, crosses in zip(
-                quad, following, is_front != np.roll(is_front, -1), strict=True
-            ):
-                if first[2] > NEAREST_M:
-                    kept.append(first)
-                if crosses:
-                    reach = (NEAREST_M - first[2]) / (second[2] - first[2])
-                    kept.append(first + reach * (second - first))
-            projected = np.array(kept) @ view.K.T
+        is_whole = depth_m.min(axis=1) > NEAREST_M
+        for quad, share, whole in zip(
+            local[is_seen], self.shares[is_seen].tolist(), is_whole[is_seen].tolist(), strict=True
+        ):
+            projected = (quad if whole else _cut(quad)) @ view.K.T
             pixels = projected[:, :2] / projected[:, 2:] - 0.5
             corners = np.rint(16 * np.clip(pixels, -1e5, 1e5)).astype(np.int32)
             cv2.fillConvexPoly(cover, corners, share, cv2.LINE_8, SUBPIXEL_BITS)
         return view.ground * cv2.GaussianBlur(cover, (0, 0), SOFT_WIDTHS * cover.shape[1])
+
+
+def _cut(quad: F64) -> F64:
+    """Return the corners ``(N, 3)`` of what lies of a quad ``(4, 3)``, in the camera's axes, beyond
+    the plane `NEAREST_M` before the camera.
+    """
+    following = np.roll(quad, -1, axis=0)
+    is_front = quad[:, 2] > NEAREST_M
+    kept = []
+    for first, second, crosses in zip(
+        quad, following, is_front != np.roll(is_front, -1), strict=True
+    ):
+        if first[2] > NEAREST_M:
+            kept.append(first)
+        if crosses:
+            reach = (NEAREST_M - first[2]) / (second[2] - first[2])
+            kept.append(first + reach * (second - first))
+    return np.array(kept)

@@ -26,7 +26,7 @@ from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F32, F64, U8, Frame, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.renderers.built_depth import BuiltDepth
 from alpasim_plugin.renderers.gaussian import CleanRenderer
-from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn
+from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn, in_image
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
 from alpasim_plugin.renderers.snow import ALBEDO, SnowCover
 from alpasim_plugin.renderers.view import View, view_of
@@ -138,12 +138,16 @@ class WeatherRenderer(Renderer):
                 f"weather over {type(self.base).__name__}: its frame has no depth",
                 "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
             )
-        rgb, camera = frame.rgb, request.camera
-        depth = frame.depth if self.built is None else self.built.of_request(request)
+        camera = request.camera
         # Of a rolling shutter the middle row's, so that no row is off by more than half of it.
         T_world_camera, actors = request.T_world_camera[-1], request.actors
         if request.exposure is not None:
             T_world_camera, actors = at_share(request, 0.5)
+        shape = camera.height, camera.width
+        if self._is_as_rendered(camera.K, T_world_camera, shape, actors, request.t_us):
+            return frame
+        rgb = frame.rgb
+        depth = frame.depth if self.built is None else self.built.of_request(request)
         taken = RecordedFrame(
             request.t_us, camera.name, camera.K, T_world_camera, actors, lambda: (rgb, depth)
         )
@@ -163,10 +167,30 @@ class WeatherRenderer(Renderer):
             else interpolate(log, np.clip(frame.t_us, log.t_us[0], log.t_us[-1]))
         )
         rgb, seen_depth = frame.read()
+        height, width = seen_depth.shape
+        if self._is_as_rendered(
+            frame.K, frame.T_world_camera, (height, width), frame.actors, frame.t_us
+        ):
+            return rgb, seen_depth
         depth = seen_depth
         if self.built is not None:
-            depth = self.built.of_recorded(frame, *seen_depth.shape)
+            depth = self.built.of_recorded(frame, height, width)
         return self._in_weather(rgb, depth, frame, T_world_rig), seen_depth
+
+    def _is_as_rendered(
+        self,
+        K: F64,
+        T_world_camera: F64,
+        shape: tuple[int, int],
+        actors: Mapping[str, F64],
+        t_us: int,
+    ) -> bool:
+        """Return whether nothing of the weather is in an image: a clear day without a traffic light
+        in view. Then nobody needs its depth.
+        """
+        return self.is_clear and not in_image(
+            self.lights.spots(actors, t_us), K, T_world_camera, shape
+        )
 
     def _in_weather(self, rgb: U8, depth: F32, frame: RecordedFrame, T_world_rig: F64) -> U8:
         """Return an image in this weather, with the ego at a pose ``(4, 4)``.

@@ -14,6 +14,7 @@ from alpasim_plugin.core.types import (
     Frame,
     Lane,
     RecordedFrame,
+    RenderRequest,
     Signal,
     Trajectory,
 )
@@ -430,6 +431,63 @@ def test_a_traffic_light_shows_its_state_by_clear_day(t_us, channel):
     away = scene(signals=(signal(phases, np.pi),))
     assert (shown(away, depth_of_wall(40.0), t_us=t_us) == GREY).all()
     assert (shown(scenario, depth_of_wall(5.0), t_us=t_us) == GREY).all()
+
+
+class Unread:
+    """The depth of a built scene that nobody may read."""
+
+    def of_request(self, request):
+        raise AssertionError("the scene is drawn a second time")
+
+    def of_recorded(self, frame, height, width):
+        raise AssertionError("the scene is drawn a second time")
+
+
+def test_a_clear_day_without_a_light_in_view_stays_as_it_is_and_nothing_is_drawn_a_second_time():
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (60, 100, 3), dtype=np.uint8)
+    rgb.ravel()[:256] = np.arange(256)
+    depth = depth_of_wall(40.0)
+    phases = (("red", 1_000_000),)
+    behind = replace(signal(phases), head=np.array([-12.0, -2.0, 3.0]))
+    for hidden in (signal(phases, np.pi), behind):
+        scenario = scene(signals=(hidden,))
+        renderer = WeatherRenderer(Flat(), scenario, 0)
+        renderer.built = Unread()
+        one = RecordedFrame(0, "front", K, AHEAD, {}, lambda: (rgb, depth))
+        renderer.base.recorded = lambda one=one: [one]
+        image, seen_depth = renderer.recorded()[0].read()
+        assert image is rgb
+        assert seen_depth is depth
+        assert np.array_equal(renderer._in_weather(rgb, depth, one, np.eye(4)), rgb)
+        spec = replace(scenario.cameras[0], name="front", width=100, height=60, K=K)
+        request = RenderRequest(0, spec, np.stack([AHEAD, AHEAD]), {})
+        frame = Frame(0, "front", rgb, np.ones((60, 100), dtype=np.float32), depth)
+        renderer.base.render = lambda request, frame=frame: frame
+        assert renderer.render(request) is frame
+    in_view = WeatherRenderer(renderer.base, scene(signals=(signal(phases),)), 0)
+    in_view.built = Unread()
+    with pytest.raises(AssertionError, match="a second time"):
+        in_view.render(request)
+
+
+def test_spots_at_the_border_of_an_image_are_those_of_a_larger_image():
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(-8, [108, 68], (300, 2))
+    depths = rng.uniform(2, 60, 300)
+    rays = np.column_stack([pixels, np.ones(300)]) @ np.linalg.inv(K).T
+    middles = (rays * depths[:, None]) @ AHEAD[:3, :3].T + AHEAD[:3, 3]
+    spots = [
+        Spot(middle, np.zeros(3), half_m, (1.0, 0.5, 0.2))
+        for middle, half_m in zip(middles, rng.uniform(0.01, 0.4, 300), strict=True)
+    ]
+    seen = view(np.zeros((60, 100), dtype=np.float32))
+    beyond = K.copy()
+    beyond[:2, 2] += 64
+    larger = view_of(np.zeros((188, 228), dtype=np.float32), beyond, AHEAD, flat())
+    inner = slice(64, -64), slice(64, -64)
+    for image, whole in zip(drawn(spots, seen), drawn(spots, larger), strict=True):
+        np.testing.assert_array_equal(image, whole[inner])
 
 
 def test_spots_behind_the_camera_are_not_drawn():
