@@ -66,3 +66,8 @@ __getattr__ = lazy_names(
         "serve_policy": ".alpasim.server.driver_service",
     },
 )
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those among them that are not yet loaded as well."""
+    return sorted(__all__)

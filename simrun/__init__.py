@@ -114,3 +114,8 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__, {name: home for home, names in HOMES.items() for name in names})
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those among them that are not yet loaded as well."""
+    return sorted(__all__)

@@ -10,6 +10,7 @@ import difflib
 import errno
 import os
 import re
+import shlex
 import sys
 import threading
 import time
@@ -131,7 +132,7 @@ LABORATORY = (
     "Install the laboratory in the clone of simrun: pip install -e alpasim_plugin/lab; beside a "
     "wheel of simrun, the laboratory's wheel (simrun docs install)."
 )
-ANYWHERE = ("-j", "--json", "-q", "--quiet", "--debug")
+ANYWHERE = ("--json", "-q", "--quiet", "--debug")
 OWN_OPTIONS = ("--help", "-h", "--version", "--install-completion", "--show-completion")
 COMPLETION = "_SIMRUN_COMPLETE"  # set by a shell that asks what a Tab offers
 PIPE_CLOSED = 141  # as shells count a process that SIGPIPE ended
@@ -236,7 +237,7 @@ def own_options(
 
 def usual(args: list[str]) -> list[str]:
     """Return a command line in one form: ``help VERB`` and ``version`` as options, a list with
-    spaces beside its commas as one word where an option takes one, ``-j`` and ``-q`` behind the
+    spaces beside its commas as one word where an option takes one, ``--json`` and ``-q`` behind the
     verb.
 
     Example:
@@ -298,6 +299,12 @@ def with_verb(args: list[str]) -> list[str]:
             f"simrun {args[0]}: the verb is not installed",
             LABORATORY,
         )
+    first, hyphen, second = args[0].partition("-")
+    if hyphen and first in verbs() and not os.path.exists(Path(args[0])):
+        raise InputError(
+            f"{args[0]}: neither a verb nor a scenario",
+            f"Type '{shlex.join(['simrun', first, second, *args[1:]])}'.",
+        )
     if re.fullmatch(r"[\w-]+", args[0]) and args[0][0] != "-" and not os.path.exists(Path(args[0])):
         near = difflib.get_close_matches(args[0].lower(), verbs(), 1, 0.7)
         guess = f"Type 'simrun {near[0]}'; the" if near else "The"
@@ -313,10 +320,10 @@ def asks_json(args: list[str]) -> bool:
     """Tell whether a command line asks for one JSON document.
 
     Example:
-        >>> asks_json(["list", "presets", "-qj"]), asks_json(["list", "presets", "-q"])
+        >>> asks_json(["list", "presets", "--json"]), asks_json(["list", "presets", "-q"])
         (True, False)
     """
-    return any(word == "--json" or re.fullmatch(r"-[jq]*j[jq]*", word) for word in args)
+    return "--json" in args
 
 
 def _document_is_ours(args: list[str]) -> bool:
@@ -371,8 +378,37 @@ def _run(args: list[str]) -> int:
             message = message.replace(error.message, detail)
         refused_by = getattr(error, "ctx", None)  # errors of options have one
         verb = refused_by.command_path if refused_by else "simrun"
-        raise InputError(f"{verb}: {message}", f"See '{verb} --help'.") from error
+        raise InputError(f"{verb}: {message}", _right_form(verb, message)) from error
     return 0
+
+
+# Words of other tools -> the option that they stand for.
+SHORT_FORMS = {
+    "-r": "--renderer",
+    "-p": "--policy",
+    "-s": "--seeds",
+    "-o": "--out",
+    "-n": "--workers",
+}
+# Beginning of a message -> the command that was meant.
+EXAMPLES = {
+    "simrun run: Missing argument 'SCENARIO...'": "simrun --renderer clean --policy lane-camera smoke/curve",
+    "simrun new: Invalid value for 'kind'": "simrun new policy my_policy",
+    "simrun new: Missing argument": "simrun new policy my_policy",
+}
+
+
+def _right_form(verb: str, message: str) -> str:
+    """Return the hint to a command line that cannot be read: the option or command that was probably
+    meant, and where all are listed.
+    """
+    word = message.removeprefix("No such option: ").split(" ")[0].rstrip(".")
+    if message.startswith("No such option: ") and word in SHORT_FORMS:
+        return f"Write {SHORT_FORMS[word]}. See '{verb} --help'."
+    for beginning, example in EXAMPLES.items():
+        if f"{verb}: {message}".startswith(beginning):
+            return f"Write for example '{example}'. See '{verb} --help'."
+    return f"See '{verb} --help'."
 
 
 def run_command(args: list[str]) -> int:

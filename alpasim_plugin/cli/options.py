@@ -24,7 +24,7 @@ FIXER_PREFIX = "fixer."
 METAVARS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH", bool: " "}
 
 Run = Annotated[Path | None, Positional("A run folder; default: the newest.")]
-Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json", also="-j")]
+Json = Annotated[bool, Flag("Print one JSON document on stdout.", "--json")]
 Debug = Annotated[bool, Flag("Show tracebacks.", "--debug")]
 Overrides = Annotated[
     tuple[str, ...], Flag("Override a scenario key: key=value. Repeatable.", "--set")

@@ -157,7 +157,7 @@ class Execution:
 
     workers: Annotated[
         int | None,
-        Flag("Worker processes; default: one per core.", min=1),
+        Flag("Worker processes; default: one per core.", also="-j", min=1),
     ] = None
     executor: Annotated[
         str,

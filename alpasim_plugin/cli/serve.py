@@ -102,7 +102,7 @@ def serve(
     host_policy: HostPolicy = HostPolicy(),
     as_json: Annotated[
         bool,
-        Flag("Print one JSON line when the port is open, and one at the end.", "--json", also="-j"),
+        Flag("Print one JSON line when the port is open, and one at the end.", "--json"),
     ] = False,
     debug: Annotated[bool, Flag("Log every failed call with its traceback.")] = False,
 ) -> None:

@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol, Self, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.map_types import F64 as F64
 from alpasim_plugin.core.map_types import Box as Box
 from alpasim_plugin.core.map_types import HeightField as HeightField
@@ -179,6 +180,14 @@ class RenderRequest:
     ahead: Sequence[RenderRequest] = ()
     # of a rolling shutter; None: all pixels are exposed at the shutter's end
     exposure: Exposure | None = None
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.T_world_camera)
+        if shape != (2, 4, 4):
+            raise InputError(
+                f"RenderRequest: T_world_camera of shape {shape}, where (2, 4, 4) is needed",
+                "Give the poses at shutter start and shutter end: np.stack([start, end]).",
+            )
 
 
 # Facts of a frame that a fixer made of recorded ones: shares of the image, 0 to 1, and both by

@@ -59,7 +59,7 @@ def here(tmp_path, monkeypatch):
         ("help", "--help"),
         ("version", "--version"),
         ("-v", "--version"),
-        ("-j list presets", "list -j presets"),
+        ("-q list presets", "list -q presets"),
         ("--renderer clean, 3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
         ("--renderer clean ,3dgs smoke/curve", "--renderer clean,3dgs smoke/curve"),
         ("--set a=[1, 2] smoke/curve", "--set a=[1,2] smoke/curve"),
@@ -78,7 +78,7 @@ def test_a_comma_where_no_list_stands_is_named(line, capsys):
 
 
 @pytest.mark.parametrize(
-    "line", ["-v", "version -j", "help", "help why", "list", "-j list presets"]
+    "line", ["-v", "version --json", "help", "help why", "list", "--json list presets"]
 )
 def test_what_asks_for_help_ends_well(line):
     assert run_command(line.split()) == 0
@@ -88,6 +88,13 @@ def test_what_asks_for_help_ends_well(line):
     ("line", "named"),
     [
         ("lits", "list"),
+        ("-r clean -p lane-camera smoke/curve", "--renderer"),
+        ("--renderer clean -p lane-camera smoke/curve", "--policy"),
+        ("check-policy parts.py:One smoke/curve", "simrun check policy parts.py:One smoke/curve"),
+        ("list-runs", "simrun list runs"),
+        ("new my_policy", "simrun new policy my_policy"),
+        ("new", "simrun new policy my_policy"),
+        ("--renderer clean --policy lane-camera", "smoke/curve"),
         ("drive", "run"),
         ("clean smoke/curve", "--renderer clean"),
         ("smoke/curve lane-camera", "--policy lane-camera"),

@@ -46,11 +46,11 @@ RUN = [*DRIVE, "--workers", "1", "--no-report", "--images", "none", "--out", "ru
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        pytest.param([*RUN, "-qj"], "summary", marks=pytest.mark.slow),
+        pytest.param([*RUN, "-q", "--json"], "summary", marks=pytest.mark.slow),
         pytest.param([*DRIVE, "--dry-run", "--json"], "rollouts", marks=pytest.mark.slow),
         (["check", "policy", "loud.py:Loud", "--json"], "checks"),
         pytest.param(
-            ["check", "renderer", "loud.py:Grey", "--scenario", "scene.yaml", "-j"],
+            ["check", "renderer", "loud.py:Grey", "--scenario", "scene.yaml", "--json"],
             "renderer",
             marks=pytest.mark.slow,
         ),
