@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InfrastructureError
 from alpasim_plugin.core.geometry import quat_from_yaw
 from alpasim_plugin.core.path_end import PathEnd, PathTracker, remaining
@@ -21,7 +22,6 @@ from evaluators import rollout_values, score
 from evaluators.metrics.outcomes import OUTCOMES
 from scenarios.load import load_scenario
 from scenarios.suite import expand
-from tests.examples import first_rows_of
 from tests.runs.grey_renderer import GREY, Grey
 from tests.runs.short_runs import Announced
 
@@ -194,38 +194,11 @@ def test_the_key_in_the_file_decides(stop, name):
     assert scenario.content_hash == load_scenario(name).content_hash  # it is the same scene
 
 
-GRID = [
-    (decel_mps2, end_mps)
-    for decel_mps2 in (1.5, 2, 3, 4, 5, 6)
-    for end_mps in (0, 4)
-    if (decel_mps2, end_mps) not in ((6, 0), (1.5, 4))
-]
-BRAKES = (
-    "actors.leader.speed_mps=11",
-    "actors.leader.s_m=24",
-    "actors.leader.brake_at_us=1500000",
-    "ego.speed_mps=11",
-    "ego.cruise_mps=11",
-)
-
-
-@pytest.mark.parametrize(
-    ("decel_mps2", "end_mps"), first_rows_of([(6, 0), (1.5, 4), *GRID], count=2)
-)
-def test_who_never_brakes_hits_a_leader_that_brakes_however_hard(decel_mps2, end_mps):
-    brakes = (f"actors.leader.decel_mps2={decel_mps2}", f"actors.leader.end_speed_mps={end_mps}")
-    scenario = load_scenario("hard/hard_brake", overrides=(*BRAKES, *brakes))
-    why, _, outcomes = ended(scenario, AsFast())
-    assert (why, "collision_at_fault" in outcomes) == ("time", True)
-
-
-def test_who_never_brakes_hits_an_adversary_and_comes_past_a_walker_who_waits():
-    adversary = load_scenario("hard/hard_brake", overrides=("actors.leader.role=adversary",))
-    assert "collision_at_fault" in ended(adversary, AsFast())[2]
+def test_who_never_brakes_comes_past_a_walker_who_waits_for_him():
     waits = load_scenario("hard/crossing_pedestrian", overrides=("actors.walker.yields=true",))
-    why, log, _ = ended(waits, AsFast())
+    why, log, outcomes = ended(waits, AsFast())
     crossing_m = 20.0 + 55.0
-    assert (why, log.ego.xyz[-1, 0] > crossing_m) == ("time", True)
+    assert (why, outcomes, log.ego.xyz[-1, 0] > crossing_m) == ("time", set(), True)
 
 
 @pytest.mark.parametrize("policy", [Creeping, Standing, AsFast, Fast])
@@ -289,6 +262,27 @@ def test_a_recording_that_ends_shortly_before_a_contact_ends_in_danger(straight_
     why, _, outcomes = ended(replace(scenario, actors=(queue,)), Fast())
     assert why == "record"
     assert outcomes == ({"ended_in_danger"} if gap_m < 10 else set())
+
+
+GATES = {
+    "limit": "{version: 1, metrics: {ended_in_danger: {max: 0}}}",
+    "pair": "{version: 1, metrics: {ended_in_danger: {max_new: 0}}}",
+}
+
+
+@pytest.mark.parametrize(("behind_m", "code"), [(20.0, 1), (120.0, 0)])
+def test_a_gate_that_names_it_is_red_where_a_rollout_ended_in_danger(tmp_path, behind_m, code):
+    (tmp_path / "road.yaml").write_text(ROAD)
+    end_m = float(load_scenario(tmp_path / "road.yaml").path_beyond[-1, 0])
+    queue = [[seconds, end_m + behind_m, -1.75, 0.0] for seconds in (0, 9)]
+    scene = f"{ROAD}actors: [{{kind: logged, id: queue, points: {queue}}}]\n"
+    (tmp_path / "road.yaml").write_text(scene)
+    words = ["--renderer", GREY, "--policy", f"log-replay,{FAST}", "--quiet", "--no-report"]
+    run = str(tmp_path / "run")
+    assert run_command([*words, str(tmp_path / "road.yaml"), "--workers", "1", "--out", run]) == 0
+    for name, text in GATES.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+        assert run_command(["gate", run, "--gate", str(tmp_path / f"{name}.yaml")]) == code
 
 
 def test_a_recorded_log_goes_on_along_its_map():
