@@ -121,6 +121,15 @@ def scene_id_of(ref: ScenarioRef) -> str:
     return _with_seed(draft, draft.spec.scene_id or draft.scene_id)
 
 
+def catches_of(ref: ScenarioRef) -> tuple[str, ...]:
+    """Return the faults of a policy that a scenario file says its scene catches.
+
+    Raises:
+        InputError: Anything wrong with the file.
+    """
+    return draw(open_document(find(ref.path), ref.source), ref.seed, ref.overrides).spec.catches
+
+
 def _with_seed(draft: SceneDraft, scene_id: str) -> str:
     """Return the id of a scene, which names a seed that is another one than its file's."""
     return f"{scene_id}-seed{draft.spec.seed}" if draft.reseeded else scene_id
@@ -345,7 +354,13 @@ def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
     """
     spec = draft.spec
     content = spec.model_dump(
-        mode="json", exclude={"description": True, "tags": True, "timing": {"stop_at_path_end"}}
+        mode="json",
+        exclude={
+            "description": True,
+            "tags": True,
+            "catches": True,
+            "timing": {"stop_at_path_end"},
+        },
     )
     if isinstance(spec.cameras, tuple):
         content["cameras"].sort(key=lambda camera: camera["name"])

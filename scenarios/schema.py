@@ -30,6 +30,25 @@ SCHEMA_FILE = Path(__file__).with_name("schema.json")
 WIDEST_PINHOLE_DEG = 120  # a wider one is smeared towards its sides
 DEFAULT_DURATION_US = 8_000_000  # of the drive on a built road
 
+FAULTS = {  # of a policy, each as tests/runs/test_catches.py drives it
+    "blind": "follows the route and looks at no road user",
+    "never_brakes": "follows the route at the speed that it has at first",
+    "brakes_late": "believes what stands ahead to be farther away than it is",
+    "mirrored": "reads its images mirrored",
+    "speed_unit": "takes its speed in km/h for m/s",
+    "sensor_black": "has a camera that gives black images",
+    "latency": "takes images of 0.8 s ago for new ones",
+}
+Fault = Literal[
+    "blind",
+    "never_brakes",
+    "brakes_late",
+    "mirrored",
+    "speed_unit",
+    "sensor_black",
+    "latency",
+]
+
 DEGRADATION_KEYS = {
     "reconstruction": ("share", "views_per_s", "depth_error", "pose_error_m"),
     "cycle": ("share", "shift_m", "views_per_s", "depth_error", "pose_error_m"),
@@ -355,6 +374,11 @@ class ScenarioSpec(Part):
     description: str = field("One sentence.", "")
     tags: tuple[str, ...] = Field(
         default=(), max_length=int(b.LISTED.high), description="Keywords."
+    )
+    catches: tuple[Fault, ...] = Field(
+        default=(),
+        max_length=len(FAULTS),
+        description="Faults of a policy that end in an event there (docs/scenarios.md).",
     )
     seed: int = number(
         0, int(b.SEED.high), "Scene seed; 0: as written, others jitter the numbers.", 0

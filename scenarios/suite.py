@@ -43,15 +43,22 @@ def suites() -> dict[str, Path]:
 
 
 def shipped() -> dict[str, str]:
-    """Return every shipped scenario and suite with its one-line description."""
+    """Return every shipped scenario and suite with its one-line description, and of a scenario the
+    faults that it catches.
+    """
     # The plain loader of libyaml: positions of keys, which messages about other people's files
     # need, take most of a listing's time.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     files = {**shipped_names(), **suites()}
+    facts = {name: yaml.load(read_text(file), loader) for name, file in files.items()}
     return {
-        name: str(yaml.load(read_text(file), loader).get("description", ""))
-        for name, file in files.items()
+        name: f"{keys.get('description', '')}{_caught_words(keys.get('catches', ()))}"
+        for name, keys in facts.items()
     }
+
+
+def _caught_words(faults: Sequence[str]) -> str:
+    return f" [catches {', '.join(faults)}]" if faults else ""
 
 
 def find(path_or_name: str | Path) -> Path:

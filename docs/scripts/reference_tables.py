@@ -1,6 +1,6 @@
-"""Write the tables of options, metrics, scenario keys, fields of file formats and members of a run
-folder's files into docs/cli.md, docs/metrics.md, docs/scenario-files.md, docs/formats.md and
-docs/runs.md, from the code.
+"""Write the tables of options, metrics, scenario keys, faults that suites catch, fields of file
+formats and members of a run folder's files into docs/cli.md, docs/metrics.md,
+docs/scenario-files.md, docs/scenarios.md, docs/formats.md and docs/runs.md, from the code.
 
     python docs/scripts/reference_tables.py [--check]
 
@@ -41,10 +41,12 @@ from scenarios.argoverse import ARGOVERSE, CALIBRATION
 from scenarios.commonroad_fields import COMMONROAD
 from scenarios.ftheta import LENS
 from scenarios.lanelet2 import LANELET2
+from scenarios.load import catches_of
 from scenarios.opendrive_fields import OPENDRIVE
 from scenarios.osi_messages import OSI
-from scenarios.schema import models
+from scenarios.schema import FAULTS, models
 from scenarios.schema_parts import Part
+from scenarios.suite import load_suite, suites
 from scenarios.usdz_fields import USDZ
 
 FORMATS = (
@@ -171,6 +173,22 @@ def key_tables() -> str:
     return "\n".join(sections)
 
 
+def fault_table() -> str:
+    """Return one row for each fault of a policy: how many scenes of each suite name it."""
+    named = {name: [catches_of(ref) for ref in load_suite(name)] for name in suites()}
+    head = [f"`{name.removeprefix('suites/')}`" for name in named]
+    totals = ("scenes", "", *(str(len(scenes)) for scenes in named.values()))
+    rows = [
+        (
+            f"`{fault}`",
+            meaning,
+            *(str(sum(fault in faults for faults in scenes)) for scenes in named.values()),
+        )
+        for fault, meaning in FAULTS.items()
+    ]
+    return table(("fault", "the policy", *head), [*rows, totals])
+
+
 def field_table() -> str:
     """Return the table of the fields that readers know."""
     head = ("form", "read", "left out without a change", "refused")
@@ -241,7 +259,8 @@ def run_page() -> str:
 def written() -> dict[Path, str]:
     """Return the pages as they should be."""
     tables = {"cli": ("options", cli_tables()), "metrics": ("metrics", metric_table()),
-              "scenario-files": ("keys", key_tables()), "formats": ("fields", field_table())}  # fmt: skip
+              "scenario-files": ("keys", key_tables()), "scenarios": ("faults", fault_table()),
+              "formats": ("fields", field_table())}  # fmt: skip
     pages = {
         (page := DOCS / f"{name}.md"): replaced(page.read_text(encoding="utf-8"), block, content)
         for name, (block, content) in tables.items()

@@ -1,5 +1,5 @@
 """The gate of docs/ci.md, word for word, on the suite that the page names, with policies whose
-drives are known: as before, worse, better, with one new collision, and not repeatable.
+drives are known: as before, worse, better, with new collisions, and not repeatable.
 """
 
 import re
@@ -56,7 +56,7 @@ def work(tmp_path_factory):
         ("log-replay", "log-replay", 0),
         ("constant-velocity", "log-replay", 1),
         ("log-replay", "constant-velocity", 0),
-        ("pure-pursuit", "log-replay", 1),  # one new collision in 14 scenes
+        ("pure-pursuit", "log-replay", 1),  # new collisions in 3 of 14 scenes
         (NOISY, "log-replay", 3),
     ],
 )

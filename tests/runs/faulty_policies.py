@@ -1,4 +1,6 @@
-"""Twenty policies with one fault each, for the page of a failure: what must stand first on it."""
+"""Policies with one fault each: for the page of a failure, what must stand first on it, and for
+scenes that say which faults they catch.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import yaw_of
 from alpasim_plugin.core.types import Plan, SensorSpec
+from policies.base import follow, make_path, plan_times, route_points, seconds, smooth_line
 from policies.lane_camera import LaneCamera
 from policies.simple import PurePursuit
 
@@ -124,6 +127,27 @@ class BlindToCars(Follower):
     """Has no fault but that it does not look."""
 
 
+class NeverBrakes(PurePursuit):
+    """Follows the route at the speed that it has at first, in bends as well."""
+
+    def act(self, observation):
+        times = plan_times(observation.t_us)
+        speed_mps = observation.ego.speed_mps
+        if self.cruise_mps is None:
+            self.cruise_mps = speed_mps
+        path = make_path(smooth_line(route_points(observation.route_rig)), speed_mps=speed_mps)
+        xy, yaw = follow(path, self.cruise_mps * seconds(times), speed_mps)
+        return Plan(observation.t_us, times, xy, yaw)
+
+
+class SpeedInKmh(PurePursuit):
+    """Takes its speed in km/h for m/s."""
+
+    def act(self, observation):
+        kmh = replace(observation.ego, speed_mps=3.6 * observation.ego.speed_mps)
+        return super().act(replace(observation, ego=kmh))
+
+
 class Looker(LaneCamera):
     """Looks at lane markings and cars."""
 
@@ -152,7 +176,7 @@ class IgnoresRoute(Looker):
         return replace(observation, route_rig=np.full_like(observation.route_rig, np.nan))
 
 
-class LateImages(Looker):
+class LateFrames(Looker):
     """Looks at images of 0.8 s ago as if they were new."""
 
     def reset(self, seed, route):
@@ -165,8 +189,22 @@ class LateImages(Looker):
             name: replace(frame, t_us=observation.frames[name].t_us)
             for name, frame in self.waiting[0].frames.items()
         }
+        return replace(observation, frames=frames)
+
+
+class LateImages(LateFrames):
+    """Looks at them alone: it has no route."""
+
+    def seen(self, observation):
         route = np.full_like(observation.route_rig, np.nan)
-        return replace(observation, frames=frames, route_rig=route)
+        return replace(super().seen(observation), route_rig=route)
+
+
+class BlackImages(Looker):
+    """Has a camera that gives black images."""
+
+    def seen(self, observation):
+        return changed(observation, np.zeros_like)
 
 
 class BrakesLate(Looker):
