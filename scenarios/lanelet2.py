@@ -429,7 +429,7 @@ def _kind(subtype: str, named: Mapping[str, bool]) -> str | None:
 def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
     """Return the bounds of a lanelet, both in the direction that has the left one on the left."""
     with parsing(f"{osm.path}, lanelet {key}", "give it one way with a length for each bound"):
-        ((left_way,), (right_way,)) = (lanelet.of(side, "way") for side in ("left", "right"))
+        left_way, right_way = (_one_way(lanelet, side) for side in ("left", "right"))
         left, right = (Bound(way, tuple(osm.nodes(way))) for way in (left_way, right_way))
         ends = [osm.line((bound.nodes[0], bound.nodes[-1])) for bound in (left, right)]
         apart = np.linalg.norm(ends[0] - ends[1], axis=1).sum()
@@ -442,6 +442,14 @@ def _bounds(osm: Osm, key: str, lanelet: Item) -> tuple[Bound, Bound]:
         left = left.turned()
         right = right.turned()
     return left, right
+
+
+def _one_way(lanelet: Item, side: str) -> str:
+    """Return the way of the bound of a side; `ValueError` where it is none or several."""
+    ways = lanelet.of(side, "way")
+    if len(ways) != 1:
+        raise ValueError(f"{len(ways)} ways for its {side} bound")
+    return ways[0]
 
 
 def _lane(

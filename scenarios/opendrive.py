@@ -165,7 +165,8 @@ def _ahead(
     linked = lane.successors if along else lane.predecessors
     next_section = index + (1 if along else -1)
     if 0 <= next_section < len(road.sections):
-        return dict(_met(road, next_section, along, i) for i in linked or (lane.lane_id,))
+        linked = linked or _linked_inside(lane, road.sections, index, along)
+        return dict(_met(road, next_section, along, i) for i in linked)
     link = road.successor if along else road.predecessor
     if link is None:
         return {}
@@ -192,6 +193,23 @@ def _met(road: Road, index: int, at_start: bool, lane_id: int) -> tuple[str, boo
         if lane.lane_id == lane_id
     )
     return lane_key(road, index, lane_id), is_entered
+
+
+def _linked_inside(
+    lane: OdrLane, sections: Sequence[Section], index: int, along: bool
+) -> tuple[int, ...]:
+    """Return the lanes of the next section of a road that follow a lane without links: those that
+    name it, or the one of its number where no lane has a link from this section to that one.
+    """
+    begin, end = index, index + (1 if along else -1)
+    ahead = [other.successors if along else other.predecessors for other in sections[begin].lanes]
+    back = {
+        other.lane_id: other.predecessors if along else other.successors
+        for other in sections[end].lanes
+    }
+    if not any(ahead) and not any(back.values()):
+        return (lane.lane_id,)
+    return tuple(name for name, linked in back.items() if lane.lane_id in linked)
 
 
 def _entered(road: Road, at_start: bool) -> int:

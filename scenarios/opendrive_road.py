@@ -344,6 +344,19 @@ def _notes(root: Element, unused: Counter[str]) -> list[str]:
     )
     if both_ways:
         notes.append(f"lanes for both directions are driven in one only: {both_ways}")
+    zeros = sum(_is_zero(speed) for speed in root.iter("speed"))
+    if zeros:
+        notes.append(f"speed limits of 0 are taken as none: {zeros}")
+    turned = sum(
+        _is_reversed(lane, road.get("rule", "RHT").upper() == "LHT")
+        for road in root.findall("road")
+        for lane in road.iter("lane")
+        if lane.get("direction") is None and lane.get("id") != "0"
+    )
+    if turned:
+        notes.append(
+            f"{turned} lanes are driven as travelDir in their userData says, against the direction of their side"
+        )
     repainted = sum(len(lane.findall("roadMark")) > 1 for lane in root.iter("lane"))
     if repainted:
         notes.append(
@@ -399,7 +412,7 @@ def _road(
         _cubics(element, "elevationProfile/elevation"),
         _cubics(element, "lateralProfile/superelevation"),
         _cubics(element, "lanes/laneOffset"),
-        _sections(element, road_m),
+        _sections(element, road_m, rule == "LHT"),
         _link(element, "successor"),
         _link(element, "predecessor"),
         signals,
@@ -440,7 +453,7 @@ def _signals_and_crosswalks(
     return tuple(signals), tuple(rings)
 
 
-def _sections(element: Element, road_m: float) -> tuple[Section, ...]:
+def _sections(element: Element, road_m: float, left_hand: bool) -> tuple[Section, ...]:
     """Return the lane sections of a road in the order of their starts.
 
     Raises:
@@ -454,7 +467,7 @@ def _sections(element: Element, road_m: float) -> tuple[Section, ...]:
         raise ValueError(f"lane sections at {starts} of a road of {road_m} m")
     ends = [*starts, road_m][1:]
     return tuple(
-        _section(section, start, end)
+        _section(section, start, end, left_hand)
         for section, start, end in zip(sections, starts, ends, strict=True)
     )
 
@@ -479,9 +492,17 @@ def _limit_at(limits: Sequence[Limit], s_m: float) -> float | None:
     return next((mps for start_m, mps in limits[::-1] if start_m <= s_m), None)
 
 
+def _is_zero(speed: Element) -> bool:
+    """Return whether a limit is 0, which RoadRunner writes where none is stated."""
+    try:
+        return float(speed.get("max", "")) == 0.0
+    except ValueError:
+        return False
+
+
 def _limit_mps(speed: Element | None) -> float | None:
     text = "" if speed is None else speed.get("max", "")
-    if speed is None or text in ("", "no limit", "undefined"):
+    if speed is None or text in ("", "no limit", "undefined") or _is_zero(speed):
         return None
     value = float(text) * UNITS_MPS[speed.get("unit", "m/s")]
     LIMIT_MPS.check(value, "speed", "max")
@@ -524,7 +545,21 @@ def _closed_to_cars(lane: Element) -> bool:
     return are_denied or are_left_out
 
 
-def _section(element: Element, start_m: float, end_m: float) -> Section:
+def _is_reversed(lane: Element, left_hand: bool) -> bool:
+    """Return whether a lane is driven against the usual direction of its side: by its attribute, and
+    where it has none by the direction of travel that RoadRunner writes into its user data.
+    """
+    if lane.get("direction") is not None:
+        return lane.get("direction") == "reversed"
+    stated = {travel.get("travelDir") for travel in lane.findall("userData/vectorLane")}
+    directions = stated & {"forward", "backward"}
+    if len(directions) != 1:
+        return False
+    is_usually_forward = (int(lane.get("id", "0")) < 0) != left_hand
+    return directions != {"forward" if is_usually_forward else "backward"}
+
+
+def _section(element: Element, start_m: float, end_m: float, left_hand: bool) -> Section:
     lanes = []
     for side in ("left", "center", "right"):
         for lane in element.findall(f"{side}/lane"):
@@ -540,11 +575,12 @@ def _section(element: Element, start_m: float, end_m: float) -> Section:
                     None
                     if mark is None
                     else (mark.get("type", "none"), mark.get("color", "standard")),
-                    lane.get("direction") == "reversed",
+                    _is_reversed(lane, left_hand),
                     lane.get("level") == "true",
                     tuple(
                         (start_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
                         for limit in lane.findall("speed")
+                        if not _is_zero(limit)
                     ),
                     _closed_to_cars(lane),
                 )

@@ -190,6 +190,51 @@ def test_links_between_lanes_that_end_at_each_other_are_said_and_not_followed():
     assert link_notes(lane_map.lanes) == ()
 
 
+def test_a_lane_without_a_link_ends_where_others_of_its_section_have_one():
+    before = section(0, lane(-1, None, -1), lane(-2), lane(-3, None, -2))
+    after = section(25, lane(-1, -1), lane(-2, -3))
+    lanes, _ = read(road("1", before, after))
+    assert [lanes.lanes[f"1.0.{i}"].successors for i in (-1, -2, -3)] == [
+        ("1.1.-1",),
+        (),
+        ("1.1.-2",),
+    ]
+    bare, _ = read(road("1", section(0, lane(-1)), section(25, lane(-1))))
+    assert bare.lanes["1.0.-1"].successors == ("1.1.-1",)
+    named_after, _ = read(road("1", section(0, lane(-1)), section(25, lane(-1), lane(-2, -1))))
+    assert named_after.lanes["1.0.-1"].successors == ("1.1.-2",)
+
+
+TRAVEL = '<userData><vectorLane sOffset="0" travelDir="%s"/></userData></lane>'
+
+
+@pytest.mark.parametrize(
+    ("more", "direction", "is_turned"),
+    [
+        ("", "forward", False),
+        ("", "backward", True),
+        ("", "undirected", False),
+        ('direction="standard"', "backward", False),
+    ],
+)
+def test_a_lane_is_driven_as_roadrunner_says(more, direction, is_turned):
+    made = lane(-1, more=more).replace("</lane>", TRAVEL % direction)
+    lanes, notes = read(road("1", section(0, made)))
+    assert span(lanes, "1.0.-1") == ((50.0, 0.0) if is_turned else (0.0, 50.0))
+    assert ("1 lanes are driven as travelDir" in str(notes)) == is_turned
+
+
+def test_a_limit_of_zero_is_none():
+    made = lane(-1).replace("</lane>", '<speed sOffset="0" max="0.0e+00" unit="mph"/></lane>')
+    text = road("1", section(0, made))
+    lanes, notes = read(text)
+    assert lanes.lanes["1.0.-1"].speed_limit_mps is None
+    assert "speed limits of 0 are taken as none: 1" in notes
+    limited = '<type s="0" type="town"><speed max="10"/></type><planView>'
+    lanes, _ = read(text.replace("<planView>", limited))
+    assert lanes.lanes["1.0.-1"].speed_limit_mps == 10.0
+
+
 def test_ways_do_not_lead_over_gaps_and_the_run_names_them(tmp_path):
     first = road("1", section(0, lane(-1, None, -1)), after="road:2:start")
     second = road("2", section(0, lane(-1, -1)), x=53, before="road:1:end")
