@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.geometry import direction_of, heading_of, se2
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Signal
 from scenarios.opendrive_road import (
@@ -45,7 +46,8 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
         for signal in road.signals:
             if signal.kind == STOP_LINE:
                 held = [
-                    _lanes_at(road, signal.s_m, along, signal, lanes) for along in _senses(signal)
+                    _lanes_at(road, signal.s_m, along, signal, lanes)
+                    for along in _senses(road, signal)
                 ]
                 stop_lines += [
                     placed(road, _line(signal.s_m, direction_lanes), T_local_map)
@@ -57,7 +59,9 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
                 top = foot + np.array([0.0, 0.0, max(signal.above_m + signal.height_m, 2.0)])
                 poles.append(np.concatenate([foot, top]))
             elif signal.kind != CROSSWALK and signal.height_m > PLATE_M:
-                heading = _heading_rad(road, signal.s_m, _senses(signal)[0], T_local_map)
+                heading = _heading_rad(
+                    road, signal.s_m, (*_senses(road, signal), True)[0], T_local_map
+                )
                 x, y, z = placed(road, np.array([[signal.s_m, signal.t_m]]), T_local_map)[
                     0
                 ].tolist()
@@ -82,13 +86,15 @@ def traffic_lights(
     that stands on a road inside of a junction, where that road's lanes begin.
     """
     heads = []
-    loose = []
+    loose: dict[str, None] = {}
     for road in _roads(odr, lanes):
         for light in (signal for signal in road.signals if signal.dynamic):
             light_heads = _heads(road, light, odr.controllers, lanes, T_local_map)
             heads += light_heads
-            loose += [] if light_heads else [light.signal_id]
-    notes = [f"{len(loose)} traffic lights hold back no lane: {', '.join(loose)}"] if loose else []
+            loose |= {} if light_heads else {light.signal_id: None}
+    holding = {head.signal.name for head in heads}
+    idle = [name for name in loose if name not in holding]
+    notes = [f"{len(idle)} traffic lights hold back no lane: {some_of(idle)}"] if idle else []
     return tuple(heads), tuple(notes)
 
 
@@ -116,14 +122,14 @@ def _heads(
     T_local_map: F64,
 ) -> list[Head]:
     heads = []
-    for along in _senses(light):
+    for along in _senses(road, light):
         link = road.successor if along else road.predecessor
         junction = f"on road {road.road_id}"
         stop_lines = [
             line.s_m
             for line in road.signals
             if line.kind == STOP_LINE
-            and along in _senses(line)
+            and along in _senses(road, line)
             and abs(line.s_m - light.s_m) <= STOP_REACH_M
         ]
         s_m = min(stop_lines, key=lambda stop_m: abs(stop_m - light.s_m), default=light.s_m)
@@ -175,9 +181,23 @@ def _for_people(
     return Signal(ends, heading, (), 0, light.signal_id, tuple(crossed), pedestrians=True)
 
 
-def _senses(signal: RoadSignal) -> tuple[bool, ...]:
-    """Return whether a signal is for traffic along its road, against it, or both."""
-    return {"+": (True,), "-": (False,)}.get(signal.orientation, (True, False))
+def _senses(road: Road, signal: RoadSignal) -> tuple[bool, ...]:
+    """Return whether a signal is for traffic along its road, against it, or both; nothing where the
+    lanes that it names are none: RoadRunner's posts stand for references on other roads.
+
+    The lanes decide where all of them are driven against the orientation, as CARLA reads RoadRunner's
+    references.
+    """
+    facing = {"+": (True,), "-": (False,)}.get(signal.orientation, (True, False))
+    if not signal.lanes:
+        return facing
+    driven = {
+        driven_along(road, lane)
+        for section in road.sections
+        for lane in section.lanes
+        if lane.lane_id != 0 and signal.holds(lane.lane_id)
+    }
+    return tuple(sense for sense in facing if sense in driven) or tuple(driven)
 
 
 Held = tuple[str, float, float]  # a lane and the signed distances of its borders
@@ -186,17 +206,14 @@ Held = tuple[str, float, float]  # a lane and the signed distances of its border
 def _lanes_at(
     road: Road, s_m: float, along: bool, signal: RoadSignal | None, lanes: Mapping[str, Lane]
 ) -> list[Held]:
-    """Return the lanes of one direction for vehicles, where a signal names some of them, only
-    those.
-    """
+    """Return the lanes of one direction for vehicles, where a signal names some, only those."""
     candidates = []
     for lane, key, inner_t, outer_t in lanes_at(road, s_m):
         made = lanes.get(key)
         for_vehicles = made is not None and made.kind in ("vehicle", "bus")
         if for_vehicles and driven_along(road, lane) == along:
             candidates.append((lane.lane_id, (key, inner_t, outer_t)))
-    named = [held for lane_id, held in candidates if signal is not None and signal.holds(lane_id)]
-    return named or [held for _, held in candidates]
+    return [held for lane_id, held in candidates if signal is None or signal.holds(lane_id)]
 
 
 def _line(s_m: float, held: Sequence[Held]) -> F64:

@@ -12,8 +12,9 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from scenarios.load import load_scenario
 from scenarios.map_lines import link_notes
-from scenarios.opendrive import lane_map_of
+from scenarios.opendrive import lane_map_of, read_lanes
 from scenarios.opendrive_road import parse_map
+from scenarios.opendrive_signals import traffic_lights
 from tests.files.opendrive_text import lane, road, section
 
 
@@ -233,6 +234,35 @@ def test_a_limit_of_zero_is_none():
     limited = '<type s="0" type="town"><speed max="10"/></type><planView>'
     lanes, _ = read(text.replace("<planView>", limited))
     assert lanes.lanes["1.0.-1"].speed_limit_mps == 10.0
+
+
+POST = """<signals><signal id="7" s="1" t="-4" dynamic="yes" type="1000001" orientation="%s"
+    height="1" width="0.5" zOffset="5"><validity fromLane="0" toLane="0"/></signal></signals>"""
+REFERENCE = """<signals><signalReference id="7" s="49" t="0" orientation="+">
+    <validity fromLane="%d" toLane="%d"/></signalReference></signals>"""
+
+
+@pytest.mark.parametrize(
+    ("named", "held"),
+    [((1, 1), ["1.0.1"]), ((-1, -1), ["1.0.-1"]), ((-1, 1), ["1.0.-1"]), ((0, 0), [])],
+)
+def test_a_light_holds_back_the_lanes_that_its_reference_names(named, held):
+    """As RoadRunner writes it: the post on a road of the junction names lane 0, the reference a lane,
+    whatever its orientation is.
+    """
+    texts = (
+        road("1", section(0, lane(1), lane(-1)), junction="9"),
+        road("2", section(0, lane(1), lane(-1)), x=90, junction="9"),
+    )
+    signals = (REFERENCE % named, POST % "-")
+    parts = [
+        text.replace("</road>", f"{more}</road>") for text, more in zip(texts, signals, strict=True)
+    ]
+    odr = parse_map("map.xodr", ElementTree.fromstring(f"<OpenDRIVE>{''.join(parts)}</OpenDRIVE>"))
+    lanes, _ = read_lanes("map.xodr", odr, np.eye(4))
+    heads, notes = traffic_lights(odr, lanes, np.eye(4))
+    assert [list(head.signal.lanes) for head in heads] == ([held] if held else [])
+    assert ("1 traffic lights hold back no lane: 7" in str(notes)) == (not held)
 
 
 def test_ways_do_not_lead_over_gaps_and_the_run_names_them(tmp_path):
