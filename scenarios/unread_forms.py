@@ -1,33 +1,48 @@
-"""Recorded drives of other tools that no reader reads, by their names, and what makes a drive of
-them.
+"""Recorded drives and scenes of other tools that no reader reads, by their names, and what makes a
+drive of them.
 """
 
 import os
 from pathlib import Path
 
 MOTION = "a scenario of Argoverse 2 motion forecasting"
-# A file or folder by which a form is recognised, its name, and the tool that converts it.
+COMMA = "a segment of openpilot (comma)"
+NUPLAN = "a file of nuPlan"
+
+
+def _by(tool: str) -> str:
+    return f"make a drive with {tool}, then simrun import drive"
+
+
+BY_PY123D = _by("py123d")
+BY_FILM = _by("COLMAP, of frames of its film")
+# A file, or a file or folder in a folder, by which a form is recognised, its name, and what to do.
 UNREAD_FORMS = (
-    ("keyframes", "a raw export of Polycam", "ns-process-data polycam (nerfstudio)"),
-    ("EXR_RGBD", "an export of Record3D", "ns-process-data record3d (nerfstudio)"),
-    ("data_poses", "KITTI-360", "py123d"),
-    ("cam0_to_world.txt", "a drive of KITTI-360", "py123d"),
-    ("rlog", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("rlog.bz2", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("rlog.zst", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("qlog", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("qlog.bz2", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("qlog.zst", "a segment of openpilot (comma)", "COLMAP, of frames of its film"),
-    ("scenario_*.parquet", MOTION, "the sensor log that it was cut from"),
-    ("*.tfrecord", "Waymo's own files", "py123d"),
-)
+    ("keyframes", "a raw export of Polycam", _by("ns-process-data polycam (nerfstudio)")),
+    ("EXR_RGBD", "an export of Record3D", _by("ns-process-data record3d (nerfstudio)")),
+    ("data_poses", "KITTI-360", BY_PY123D),
+    ("cam0_to_world.txt", "a drive of KITTI-360", BY_PY123D),
+    ("2013_05_28_drive_*_sync", "KITTI-360", BY_PY123D),
+    *((f"{log}{ending}", COMMA, BY_FILM)
+      for log in ("rlog", "qlog") for ending in ("", ".bz2", ".zst")),
+    ("scenario_*.parquet", MOTION, _by("the sensor log that it was cut from")),
+    ("*.tfrecord", "a file of Waymo", BY_PY123D),
+    ("v1.0-*", "nuScenes", BY_PY123D),
+    ("*.db", NUPLAN, BY_PY123D),
+    ("*.gpkg", NUPLAN, BY_PY123D),
+    ("*.bag", "a bag of ROS", BY_FILM),
+    ("*.db3", "a bag of ROS", BY_FILM),
+    ("*.xosc", "a file of OpenSCENARIO", "run it in esmini, and give the OSI trace that it records"),
+)  # fmt: skip
 
 
-def unread_form(folder: Path) -> tuple[str, str] | None:
-    """Return the name of a form that has no reader, and what makes a drive of it; None where no such
-    form is recognised.
+def unread_form(path: Path) -> tuple[str, str] | None:
+    """Return the name of the form of a file or a folder that has no reader, and what makes a drive of
+    it; None where no such form is recognised.
     """
-    for pattern, form, tool in UNREAD_FORMS:
-        if os.path.isdir(folder) and any(folder.glob(pattern)):
-            return form, f"make a drive with {tool}, then simrun import drive"
+    for pattern, form, do_this in UNREAD_FORMS:
+        if os.path.isdir(path) and any(path.glob(pattern)):
+            return form, do_this
+        if os.path.isfile(path) and path.match(pattern):
+            return form, do_this
     return None

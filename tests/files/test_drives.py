@@ -706,11 +706,18 @@ def test_a_focal_length_and_an_angle_of_view_that_disagree_are_said(tmp_path, ke
         ("rlog.zst", "openpilot"),
         ("scenario_0a1e.parquet", "motion forecasting"),
         ("segment-1.tfrecord", "Waymo"),
+        ("2013_05_28_drive_0000_sync/cam0_to_world.txt", "KITTI-360"),
+        ("v1.0-mini/scene.json", "nuScenes"),
+        ("2021.05.12.22.db", "nuPlan"),
+        ("map.gpkg", "nuPlan"),
+        ("drive.bag", "ROS"),
+        ("cut-in.xosc", "OpenSCENARIO"),
     ],
 )
 def test_forms_without_a_reader_are_refused_by_their_names(tmp_path, entry, form):
     (tmp_path / entry).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / entry).write_bytes(b"")
-    with pytest.raises(InputError, match=form):
-        read_source(tmp_path)
-    assert form in str(import_advice(tmp_path))
+    for path in [tmp_path] if "/" in entry else [tmp_path, tmp_path / entry]:
+        with pytest.raises(InputError, match=form):
+            read_source(path)
+        assert form in str(import_advice(path))
