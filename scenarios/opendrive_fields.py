@@ -29,7 +29,9 @@ OPENDRIVE = Fields(
         "lanes": "laneOffset laneSection",
         "laneSection": "@s @singleSide left center right",
         **dict.fromkeys(("left", "center", "right"), _SIDE),
-        "lane": "@id @type @level @direction link width border roadMark speed access",
+        "lane": "@id @type @level @direction link width border roadMark speed access userData",
+        "userData": "vectorLane",
+        "vectorLane": "@travelDir",
         "access": "@sOffset @rule @restriction restriction",
         "restriction": "@type",
         **dict.fromkeys(("width", "border"), f"@sOffset {_CUBIC}"),
@@ -61,7 +63,9 @@ OPENDRIVE = Fields(
         "type": "@type @country userData",
         "laneSection": "userData",
         "shape": f"{_PLACE} {_CUBIC}",  # a note of its own counts them
-        "lane": "userData material @roadWorks @dynamicLaneDirection @dynamicLaneType",
+        "lane": "material @roadWorks @dynamicLaneDirection @dynamicLaneType",
+        "userData": "@code @value fillet style",
+        "vectorLane": "@sOffset @laneId predecessor successor",
         "roadMark": """@sOffset @weight @material @width @laneChange @height type sway explicit
             userData""",
         "lanes": "userData",
