@@ -7,6 +7,8 @@ from functools import partial
 
 from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.errors import InputError, PolicyError, SimrunError
+from alpasim_plugin.core.files import content_of, real
+from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import PartSpec, complete
 from alpasim_plugin.core.parts.registry import entries
@@ -15,6 +17,7 @@ from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Scenario, SensorSpec
 from alpasim_plugin.log.run_folder.records import PolicyCheck
 from alpasim_plugin.runs.cameras import CameraRig
+from alpasim_plugin.runs.changes import changed_inputs
 from alpasim_plugin.runs.execute import HowToRun
 from alpasim_plugin.runs.guards import checked_sensors
 from alpasim_plugin.runs.local_executor import Lost, run_jobs
@@ -68,8 +71,8 @@ def check_policies(
 
     Args:
         plan: The run.
-        earlier_checks: What an earlier command of the run found; a policy of the same digest is not
-            checked again.
+        earlier_checks: What an earlier command of the run found; a policy in which it found no
+            breach is not checked again while its digest and the files that it read are the same.
         how: Workers and the time limit of a rollout.
         noticed: Called with one line for each breach.
 
@@ -83,7 +86,7 @@ def check_policies(
     todo = []
     for policy in plan.policies:
         before = earlier_checks.get(policy.name)
-        if before is not None and policy.digest is not None and before.digest == policy.digest:
+        if before is not None and _holds_still(before, policy):
             checks[policy.name] = before
         elif policy.target in shipped:
             frames_asked(policy, scenarios)
@@ -113,6 +116,15 @@ def check_policies(
         for _, sentence in checks[policy.name].breaches:
             noticed(f"check of {policy.name}: {sentence}")
     return checks
+
+
+def _holds_still(before: PolicyCheck, policy: PartSpec) -> bool:
+    """Tell whether a check would find the same again: no breach, which may come from the world outside,
+    and nothing that the policy is made of, or read, is another one.
+    """
+    if before.breaches or policy.digest is None or before.digest != policy.digest:
+        return False
+    return not changed_inputs(before.inputs)
 
 
 def _check_address(policy: PartSpec, scenarios: Iterable[Scenario]) -> None:
@@ -153,7 +165,7 @@ def _of_lost(lost: Lost, limit_s: float | None) -> PolicyCheck:
 def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> PolicyCheck | InputError:
     """Check one policy, in a worker."""
     try:
-        with parts_print_to_stderr():
+        with parts_print_to_stderr(), Inputs() as inputs:
             with suppress(PolicyError):  # the check says more of it
                 frames_asked(policy, scenarios)
             report = check_policy(policy.name, scenarios[0])
@@ -166,4 +178,15 @@ def _check(scenarios: Sequence[Scenario], policy: PartSpec) -> PolicyCheck | Inp
         None,
         breaches=tuple((check.name, check.sentence) for check in breaches),
         notes=tuple((note.name, note.sentence) for note in report.notes),
+        inputs=_beside_digest(policy, inputs),
     )
+
+
+def _beside_digest(policy: PartSpec, inputs: Inputs) -> dict[str, str]:
+    """Return what a policy read that its digest does not cover and that is still there, by path."""
+    held = {str(real(path)) for path in (*policy.code, *policy.files)}
+    return {
+        path: content
+        for path, content in inputs.files.items()
+        if path not in held and content_of(path) == content
+    }

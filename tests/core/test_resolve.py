@@ -1,6 +1,7 @@
 """What a name stands for, what a part declares, and what its digest sees."""
 
 from functools import partial
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.parts import build, complete, names, resolve, resolve_renderer
 from alpasim_plugin.core.parts.blame import is_own
-from alpasim_plugin.core.parts.source import code_digest, reached
+from alpasim_plugin.core.parts.source import code_digest, code_files, reached
 from alpasim_plugin.core.parts.spec import KINDS
 from evaluators.metrics.parts import PARTS
 from evaluators.metrics.presets import PRESETS
@@ -73,6 +74,22 @@ def test_the_digest_follows_imports_wherever_they_stand(tmp_path):
     assert names == {"__init__", "part", "near", "other", "typed", "beside"}
     before = code_digest(part)
     (tmp_path / "beside.py").write_text("import pack.part  # edited\n")
+    assert code_digest(part) != before
+
+
+@pytest.mark.parametrize("place", [".", "elsewhere"])
+def test_a_compiled_module_is_code_of_the_part_that_imports_it(tmp_path, monkeypatch, place):
+    folder = tmp_path / place
+    folder.mkdir(exist_ok=True)
+    compiled = folder / f"compiled_of_a_user{EXTENSION_SUFFIXES[0]}"
+    compiled.write_bytes(b"first")
+    monkeypatch.syspath_prepend(folder)
+    part = tmp_path / "part.py"
+    part.write_text("def late():\n    import compiled_of_a_user\n")
+    before = code_digest(part)
+    assert {Path(path).name for path in code_files(part)} == {"part.py", compiled.name}
+    assert resolve("policy", f"{part}:late").target == f"{part}:late"
+    compiled.write_bytes(b"compiled again")
     assert code_digest(part) != before
 
 

@@ -145,6 +145,35 @@ def test_a_policy_that_rewrites_its_state_is_driven_again_each_time_and_it_is_sa
     assert read_json(state) > 2
 
 
+ENDS = """
+import os
+from pathlib import Path
+from policies.simple import ConstantVelocity
+
+class Mine(ConstantVelocity):
+    def act(self, observation):
+        if Path("{folder}/broken").exists():
+            os._exit(1)
+        return super().act(observation)
+"""
+
+
+def test_a_policy_that_ended_its_process_in_the_check_is_checked_again(
+    tmp_path, monkeypatch, capfd
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken").touch()
+    (tmp_path / "ends.py").write_text(ENDS.replace("{folder}", str(tmp_path)))
+    command = [*WORDS, "--policy", "constant-velocity,ends.py:Mine", "--set", *SHORT]
+    command += ["--out", "run", "smoke/straight"]
+    assert run_command(command) == 2
+    (tmp_path / "broken").unlink()
+    assert run_command(command) == 0
+    check = read_run_json(Path("run")).policy_checks["ends.py:Mine"]
+    assert check.breaches == ()
+    capfd.readouterr()
+
+
 SOURCE = """
 from alpasim_plugin.core.files import read_json
 from tests.core.toy.toy_parts import Csv

@@ -15,6 +15,8 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +126,11 @@ def _reached(start: str, everywhere: bool) -> set[str]:
                     folders[name] = _folder_elsewhere(name)
                 folder = folders[name]
             if folder is not None:
-                files = (module_file(folder, module[:n]) for n in range(1, len(module) + 1))
-                todo += [(found, folder) for found in files if found is not None]
+                lengths = range(1, len(module) + 1)
+                for length, endings in product(lengths, (SOURCE_SUFFIXES, EXTENSION_SUFFIXES)):
+                    file = module_file(folder, module[:length], endings)
+                    if file is not None:
+                        todo.append((file, folder))
     return visited
 
 
@@ -156,18 +161,22 @@ def top_folder(file: str) -> str:
     return folder
 
 
-def module_file(root: str, parts: Sequence[str]) -> str | None:
+def module_file(
+    root: str, parts: Sequence[str], endings: Sequence[str] = SOURCE_SUFFIXES
+) -> str | None:
     """Return the file of a module below a folder, ``__init__.py`` of a package; None where there is
-    none.
+    none with one of these endings.
     """
     path = os.path.join(root, *parts)
-    candidates = (os.path.join(path, "__init__.py"), f"{path}.py")
+    candidates = (os.path.join(path, "__init__.py"), *(f"{path}{ending}" for ending in endings))
     return next((file for file in candidates if os.path.isfile(file)), None)
 
 
 def _imports(path: str, root: str) -> Iterator[list[str]]:
     """Yield the dotted name of everything that a module may import, relative ones made absolute."""
     package = list(Path(os.path.relpath(path, root)).parent.parts)
+    if path.endswith(tuple(EXTENSION_SUFFIXES)):
+        return  # compiled: what it imports is not seen
     try:
         tree = ast.parse(read_bytes(path))
     except (SyntaxError, ValueError):  # the import itself will say so
@@ -322,6 +331,8 @@ def make_importable(target: str) -> str:
     root = top_folder(file)
     if INSTALLED.isdisjoint(Path(root).parts):
         for path in sorted(reached(file) - {os.path.join(root, os.path.basename(file))}):
+            if not path.endswith(".py"):
+                continue  # a compiled module is found by Python alone
             top = Path(os.path.relpath(path, root)).parts[0].removesuffix(".py")
             if not _is_installed(top):
                 _serve(top, module_file(root, [top]))

@@ -134,11 +134,13 @@ class PolicyCheck:
         digest: Of the policy that was checked.
         breaches: Name and sentence of each rule that it breaks.
         notes: Name and sentence of what is allowed and worth knowing.
+        inputs: Path of each file that it read in the check, beside those of its digest -> digest.
     """
 
     digest: str | None
     breaches: tuple[tuple[str, str], ...] = ()
     notes: tuple[tuple[str, str], ...] = ()
+    inputs: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
