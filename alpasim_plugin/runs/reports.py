@@ -84,7 +84,7 @@ MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any ot
 
 def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:
     """Return the entries of ``flips.json`` about a rollout; none where the file is absent."""
-    return [entry for entry in flip_entries(run) if key_of_entry(entry)[:4] == rollout.cell]
+    return [entry for entry in flip_entries(run) if key_of_entry(entry)[:5] == rollout.key]
 
 
 MAX_FLIPS = 60  # rollouts whose logs are read
@@ -107,6 +107,7 @@ def write_flips(run: Run) -> None:
             "scene": flip.other.scene,
             "seed": flip.other.seed,
         }
+        key |= {"log": flip.other.log} if flip.other.log else {}
         cells.append(
             key
             | {"baseline": flip.base.renderer, "against": flip.base.variant}

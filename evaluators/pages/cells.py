@@ -30,7 +30,14 @@ from evaluators.pages.drive_data import (
     plans_part,
     scene_of,
 )
-from evaluators.pages.flips import Flip, baseline_of, find_flips, flip_entries, key_of_entry
+from evaluators.pages.flips import (
+    Flip,
+    baseline_of,
+    find_flips,
+    flip_entries,
+    key_of_entry,
+    takes_of,
+)
 from evaluators.pages.images import (
     NO_FRAMES,
     encoded,
@@ -193,15 +200,17 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
             takes[rollout.cell] += 1
             key = (rollout.scene, getattr(rollout, fixed), rollout.seed, take)
             grouped.setdefault(key, []).append(rollout)
-    flips: dict[tuple[str, str, int], list[Flip]] = {}
+    takes_by_key = dict(zip((one.key for one in run.rollouts), takes_of(run.rollouts), strict=True))
+    flips: dict[tuple[str, str, int, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
         other = flip.other
         held = getattr(flip.other, fixed)
         # a cell shows one policy behind all renderers, or the other way round
         if getattr(flip.base, fixed) == held and wanted.takes(other):
-            flips.setdefault((other.scene, held, other.seed), []).append(flip)
+            key = (other.scene, held, other.seed, takes_by_key[other.key])
+            flips.setdefault(key, []).append(flip)
     cells = [
-        WatchedCell(*key, tuple(members), tuple(flips.get(key[:3], ())), by_policy)
+        WatchedCell(*key, tuple(members), tuple(flips.get(key, ())), by_policy)
         for key, members in grouped.items()
     ]
 

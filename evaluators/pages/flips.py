@@ -2,6 +2,7 @@
 
 import base64
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,8 +19,8 @@ from evaluators.statistics.variants import Base, Variant, axis_bases
 FLIPS_NAME = "flips.json"
 MAX_FLIP_ROWS = 400
 TOO_MANY = "left out to keep this file small; they are in flips/"
-# renderer, policy, scene, seed of the other side; RENDERER/POLICY of the baseline's
-FlipKey = tuple[str, str, str, int, str]
+# renderer, policy, scene, seed, log of the other side; RENDERER/POLICY of the baseline's
+FlipKey = tuple[str, str, str, int, str, str]
 
 
 def colours_of(run: Run) -> dict[tuple[str, str], tuple[int, int]]:
@@ -55,7 +56,7 @@ class Flip:
     @property
     def key(self) -> FlipKey:
         """Give what names it among the flips of a run."""
-        return (*self.other.cell, self.base.variant)
+        return (*self.other.key, self.base.variant)
 
     @property
     def sides(self) -> tuple[str, str]:
@@ -80,17 +81,19 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
         compared.
     """
     bases = flip_bases(run)
-    by_cell: dict[tuple[str, str, str, int], Rollout] = {}
-    for rollout in run.rollouts:
-        if has_ended(rollout):
-            by_cell.setdefault(rollout.cell, rollout)
+    takes = takes_of(run.rollouts)
+    by_take = {
+        (*rollout.cell, take): rollout
+        for rollout, take in zip(run.rollouts, takes, strict=True)
+        if has_ended(rollout)
+    }
     flips = []
     compared = 0
-    for rollout in run.rollouts:
+    for rollout, take in zip(run.rollouts, takes, strict=True):
         for base in bases if has_ended(rollout) else ():
             variant = Variant(rollout.renderer, rollout.policy)
             other = base.of(variant)
-            partner = by_cell.get((other.renderer, other.policy, rollout.scene, rollout.seed))
+            partner = by_take.get((other.renderer, other.policy, rollout.scene, rollout.seed, take))
             if other == variant or partner is None or not (rollout.ok or partner.ok):
                 continue
             compared += 1
@@ -101,6 +104,18 @@ def find_flips(run: Run) -> tuple[list[Flip], int]:
                 flips.append(Flip(partner, rollout, in_words(was), in_words(now), tone))
     order = {"worse": 0, "mixed": 1, "better": 2}
     return sorted(flips, key=lambda flip: order[flip.tone]), compared
+
+
+def takes_of(rollouts: Sequence[Rollout]) -> list[int]:
+    """Return for each rollout how many of its cell come before it: 0, but for several logs of one
+    cell, of which the first is compared with the first, the second with the second.
+    """
+    counts: Counter[tuple[str, str, str, int]] = Counter()
+    takes = []
+    for rollout in rollouts:
+        takes.append(counts[rollout.cell])
+        counts[rollout.cell] += 1
+    return takes
 
 
 def flip_bases(run: Run) -> list[Base]:
@@ -195,4 +210,5 @@ def flip_entries(run: Run) -> list[JsonView]:
 
 def key_of_entry(entry: JsonView) -> FlipKey:
     """Return the key of an entry of ``flips.json``."""
-    return entry["renderer"], entry["policy"], entry["scene"], entry["seed"], entry["against"]
+    cell = entry["renderer"], entry["policy"], entry["scene"], entry["seed"]
+    return *cell, entry.get("log", ""), entry["against"]

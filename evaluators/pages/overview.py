@@ -27,6 +27,7 @@ from evaluators.statistics.numbers import (
 )
 from evaluators.statistics.opening import Run
 from evaluators.statistics.sentences import are_shipped, fewest_scenes, open_text, shipped_text
+from evaluators.statistics.variants import Variant
 
 Tone = Literal["worse", "better", "mixed", "unclear", "neutral"]
 
@@ -91,6 +92,7 @@ class VariantRow:
         distance: Median of its distance from the logged path.
         is_cut_short: Steps after an event are not in that distance.
         places: Ending -> scene and time of its failures, the gravest first.
+        is_baseline: Others are compared with it.
     """
 
     key: str
@@ -102,6 +104,7 @@ class VariantRow:
     is_cut_short: bool
     frame_ms: str
     places: Mapping[str, Sequence[str]]
+    is_baseline: bool
 
     @property
     def n_rollouts(self) -> int:
@@ -270,7 +273,11 @@ def overview_of(run: Run) -> Overview:
     boundary = summary.boundary
     is_sequential = decision is not None or boundary is not None
     differences = {} if is_sequential else differences_of(run)
-    rows = tuple(_row(run, name, entry, differences) for name, entry in summary.outcomes.items())
+    bases = set() if is_sequential else compared_with(run)
+    rows = tuple(
+        _row(run, name, entry, differences, name in bases)
+        for name, entry in summary.outcomes.items()
+    )
     primary = run.table.shown(run.table.primary)
     size = (plural(len(run.scenes), "scene"), plural(len(run.info.seeds), "seed"))
     named = some_of(run.info.asked or (), 2)
@@ -333,20 +340,48 @@ def differences_of(run: Run) -> dict[str, PrimaryDifference]:
     """Return KEY of ``summary.json`` -> the primary difference of that variant: to the baseline's
     renderer where there are several, else to its policy.
     """
+    metric = run.table.shown(run.table.primary)
+    return {
+        key: _primary_difference(
+            metric, entry, diff, variant_name(run, key), variant_name(run, entry.baseline)
+        )
+        for key, (entry, diff) in primary_entries(run).items()
+    }
+
+
+def primary_entries(run: Run) -> dict[str, tuple[Difference, float]]:
+    """Return KEY of ``summary.json`` -> the difference of the primary metric that the first screen
+    shows, and its value.
+    """
     summary = run.summary
     blocks = [summary.paired] if summary.paired else [summary.paired_with_base]
     if not summary.paired:
         blocks.append(summary.paired_policies)
-    metric = run.table.shown(run.table.primary)
-    differences: dict[str, PrimaryDifference] = {}
+    entries: dict[str, tuple[Difference, float]] = {}
     for block in blocks:
         for key, pairs in block.items():
-            entry = pairs.get(metric.name)
-            if key not in differences and entry is not None and entry.diff is not None:
-                baseline = variant_name(run, entry.baseline)
-                name = variant_name(run, key)
-                differences[key] = _primary_difference(metric, entry, entry.diff, name, baseline)
-    return differences
+            entry = pairs.get(run.table.primary)
+            if key not in entries and entry is not None and entry.diff is not None:
+                entries[key] = entry, entry.diff
+    return entries
+
+
+def compared_with(run: Run) -> set[str]:
+    """Return the variants, RENDERER/POLICY, that others are compared with on the first screen."""
+    by_key: dict[str, Variant] = {}
+    for rollout in run.rollouts:
+        variant = Variant(rollout.renderer, rollout.policy)
+        by_key[variant.name] = variant
+        if len(run.policies) == 1:
+            by_key[variant.renderer] = variant
+    bases = set()
+    for key, (entry, _) in primary_entries(run).items():
+        base = by_key.get(entry.baseline)
+        if base is None and key in by_key:  # a renderer, for each of several policies
+            base = Variant(entry.baseline, by_key[key].policy)
+        if base is not None:
+            bases.add(base.name)
+    return bases
 
 
 def _primary_difference(
@@ -411,7 +446,11 @@ def _with_shipped_scenes(run: Run, rows: Sequence[VariantRow]) -> str:
 
 
 def _row(
-    run: Run, variant: str, entry: Endings, differences: Mapping[str, PrimaryDifference]
+    run: Run,
+    variant: str,
+    entry: Endings,
+    differences: Mapping[str, PrimaryDifference],
+    is_baseline: bool,
 ) -> VariantRow:
     summary = run.summary
     renderer = variant.removesuffix(f"/{run.policies[0]}") if len(run.policies) == 1 else variant
@@ -432,6 +471,7 @@ def _row(
         median_m is not None and is_cut_short,
         DASH if mean_ms is None else fixed(mean_ms, 0 if mean_ms >= 10 else 1),
         _places_of(entry),
+        is_baseline,
     )
 
 

@@ -2,6 +2,7 @@
 failed, and a variant that repairs it, side by side.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from evaluators.pages.overview import variant_name
 from evaluators.statistics.opening import Run
 
 SHOWN = 3
+LOOKED_AT = 8  # changes, until one has an image
 WIDTH_PX = 420
 
 
@@ -52,19 +54,34 @@ def worst_change(run: Run) -> list[Shot]:
     led to an event is shown: after a contact the camera may be inside the other vehicle.
     """
     flips, _ = find_flips(run)
-    flip = next((flip for flip in flips if flip.tone != "better"), None)
-    worst = (
-        min((rollout for rollout in run.rollouts if rollout.ok), key=_rank, default=None)
-        if flip is None
-        else flip.other
-    )
-    log = None if worst is None else _log_of(run, worst)
-    if worst is None or log is None:
-        return []
+    changes: Sequence[tuple[Rollout, Rollout | None]] = [
+        (flip.other, flip.base) for flip in flips if flip.tone != "better"
+    ]
+    if not changes:
+        changes = [(rollout, None) for rollout in sorted(run.rollouts, key=_rank) if rollout.ok][:1]
+    # A rollout that broke off before it saw anything has no image: the next change stands there.
+    for worst, base in changes[:LOOKED_AT]:
+        t_us = _instant_of(run, worst)
+        if t_us is not None and _shot(run, worst, t_us) is not None:
+            return _shots_at(run, worst, base, t_us)
+    return []
+
+
+def _instant_of(run: Run, worst: Rollout) -> int | None:
+    """Return the instant of a rollout that is shown, microseconds; None without a log."""
+    log = _log_of(run, worst)
+    if log is None:
+        return None
+    if not worst.ok:
+        return int(log.ego.t_us[-1])
     manifest = run.manifest(worst)
     failure = None if manifest is None else first_failure(manifest.events)
-    t_us = int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure.t_us)
-    chosen = {worst.cell, *(() if flip is None else (flip.base.cell,))}
+    return int(log.ego.t_us[len(log.ego.t_us) // 2] if failure is None else failure.t_us)
+
+
+def _shots_at(run: Run, worst: Rollout, base: Rollout | None, t_us: int) -> list[Shot]:
+    """Return the images of a rollout, of what it is compared with, and of others beside it."""
+    chosen = {worst.key, *(() if base is None else (base.key,))}
     beside = [
         rollout
         for rollout in run.by_scene[worst.scene]
@@ -74,8 +91,8 @@ def worst_change(run: Run) -> list[Shot]:
     bases = run.info.bases
     for rollout in sorted(beside, key=lambda other: bases.get(other.renderer) != worst.renderer):
         if len(chosen) < SHOWN:
-            chosen.add(rollout.cell)
-    shots = (_shot(run, rollout, t_us) for rollout in beside if rollout.cell in chosen)
+            chosen.add(rollout.key)
+    shots = (_shot(run, rollout, t_us) for rollout in beside if rollout.key in chosen)
     return [shot for shot in shots if shot is not None]
 
 
@@ -85,7 +102,7 @@ def _rank(rollout: Rollout) -> tuple[int, float]:
 
 
 def _log_of(run: Run, rollout: Rollout) -> RolloutLog | None:
-    path = run.file_of(rollout, LOG_NAME)
+    path = run.file_of(rollout, LOG_NAME) or run.file_of(rollout, f"{LOG_NAME}.part")
     try:
         return None if path is None else read_log(path)
     except SimrunError:

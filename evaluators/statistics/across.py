@@ -117,7 +117,7 @@ def compare_runs(
     after = second.info.weights
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
     # what differs in their weights are other variants, whatever their names
-    notes = (f"other weights: {', '.join(changed)}",) if changed else ()
+    notes: tuple[str, ...] = (f"other weights: {', '.join(changed)}",) if changed else ()
     foreign = not {*table.policies} & {*base.policies}
     if foreign and len(base.policies) == len(table.policies) == 1:
         note = f"policy {table.policies[0]} is compared with policy {base.policies[0]}"
@@ -134,6 +134,7 @@ def compare_runs(
         foreign = False
     several = len(table.policies) > 1 or named.policy is not None
     pairs = []
+    alone = []
     for variant in variants_in(table):
         other = named.of(variant)
         if foreign:
@@ -148,10 +149,27 @@ def compare_runs(
             called = other.name if named.policy is not None else other.renderer
             key = variant.name if several else variant.renderer
             pairs.append(Pair(key, variant, other, f"{first.folder}: {called}"))
+        else:
+            alone.append(variant.name)
     if not pairs:
         raise InputError(
             f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
         )
+    partners = {pair.other for pair in pairs}
+    left = [] if baseline is not None else base_variants
+    notes += without_partner(alone, second, first)
+    notes += without_partner([one.name for one in left if one not in partners], first, second)
     metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, folders)
     tables = compare_pairs(table, {BLOCKS[0]: pairs}, metrics, base, listed)
     return Comparison(tables[BLOCKS[0]], notes=notes, metrics=metrics)
+
+
+def without_partner(names: Sequence[str], run: Run, other: Run) -> tuple[str, ...]:
+    """Say which variants of a run are not compared since the other run has none of that name;
+    nothing where there are none.
+    """
+    if not names:
+        return ()
+    return (
+        f"not compared, since {other.folder} has no partner: {', '.join(names)} of {run.folder}",
+    )

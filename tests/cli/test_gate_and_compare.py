@@ -382,3 +382,17 @@ def test_a_suite_that_has_not_been_driven_is_refused_if_its_scenes_cannot_decide
     printed = capsys.readouterr()
     assert ("36" in printed.err) == (code == 2)
     assert run_command(["gate", suite, "--gate", str(gate), "--out", str(tmp_path)]) == 2
+
+
+def test_compare_names_the_variants_without_a_partner(tmp_path, capsys):
+    folders = []
+    for name, policies in (("before", ("a", "gone")), ("after", ("a", "new"))):
+        plan = Plan(("clean",), policies, ("s",), (0,), steps=5, clips=False)
+        folders.append(str(make_run(tmp_path / name, plan)))
+    run_command(["compare", *folders, "--json"])
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert len(notes) == 2
+    assert "clean/new of" in notes[0]
+    assert "clean/gone of" in notes[1]
+    run_command(["compare", folders[0], folders[0], "--json"])
+    assert json.loads(capsys.readouterr().out)["notes"] == []

@@ -102,7 +102,7 @@ def _write_flips(folder, plan):
     cells = []
     for number, flip in enumerate(flips):
         key = dict(
-            zip(("renderer", "policy", "scene", "seed", "against"), flip.key, strict=True)
+            zip(("renderer", "policy", "scene", "seed", "log", "against"), flip.key, strict=True)
         ) | {"baseline": flip.base.renderer}
         if number == 1:
             cells.append(

@@ -56,6 +56,9 @@ def test_every_rollout_is_counted_once_under_its_variant(usual_run):
         counts = [int(cell) for cell in cells[: len(shown.endings)]]
         assert name == row.name
         assert sum(counts) == row.n_rollouts
+    assert [row for row in shown.rows if row.is_baseline] == [
+        row for row in shown.rows if row.difference is None
+    ]
     assert [row.name for row in shown.rows if row.difference is None] == [
         "clean/lane-camera",
         "clean/pure-pursuit",
@@ -270,6 +273,32 @@ def test_images_are_of_one_instant_baseline_variant_and_what_repairs_it(three, m
         data = np.frombuffer(base64.b64decode(shot.src.split(",")[1]), dtype=np.uint8)
         upper, lower = np.split(cv2.imdecode(data, cv2.IMREAD_COLOR), 2)
         np.testing.assert_allclose((upper.mean(), lower.mean()), (150.0, 60.0), atol=3)
+
+
+def test_where_the_policy_broke_before_it_saw_anything_the_next_change_has_the_image(
+    three, monkeypatch
+):
+    run = read_run(three)
+    cell = [one for one in run.rollouts if (one.scene, one.seed) == (run.scenes[0], 0)]
+    base, unseen, late = (dataclasses.replace(one, metrics={}) for one in cell)
+    unseen, late = (
+        dataclasses.replace(one, status="failed", failure_class="policy") for one in (unseen, late)
+    )
+    run = dataclasses.replace(run, rollouts=(base, unseen, late))
+    images = [SimpleNamespace(camera="front", end_us=k * 100_000, data=grey(10)) for k in range(9)]
+    ego = SimpleNamespace(t_us=np.arange(9) * 100_000)
+    log = SimpleNamespace(images=images, render_start_us=0, ego=ego)
+    for one in (unseen, late):
+        (run.folder / one.path / "rollout.asl").unlink(missing_ok=True)
+    for one, name in ((base, "rollout.asl"), (late, "rollout.asl.part")):
+        (run.folder / one.path / name).touch()
+    monkeypatch.setattr(worst, "read_log", lambda path: log)
+    shots = worst.worst_change(run)
+    assert [(shot.variant, shot.outcome) for shot in shots] == [
+        (base.renderer, "no event"),
+        (late.renderer, "policy fault"),
+    ]
+    assert [shot.t_s for shot in shots] == pytest.approx([0.8, 0.8])
 
 
 def test_the_worst_rollout_failed_or_is_the_farthest_from_its_path(three):

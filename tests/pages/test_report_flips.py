@@ -1,11 +1,13 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.outcomes import in_words, outcomes_of
+from evaluators.pages.cells import cells_of
 from evaluators.pages.flips import find_flips, flip_rows
 from evaluators.pages.html import write_report
 from evaluators.statistics.opening import Run, read_run
@@ -86,7 +88,21 @@ def test_policies_behind_one_renderer_flip_as_renderers_do():
         Run(Path(), run_info({**MINIMAL, "policies": ["a", "b"]}), rollouts, ())
     )
     assert (compared, flip.sides, flip.was, flip.now) == (1, ("a", "b"), "no event", "off-road")
-    assert flip.key == ("clean", "b", "s", 0, "clean/a")
+    assert flip.key == ("clean", "b", "s", 0, "", "clean/a")
+
+
+def test_of_two_logs_of_a_cell_the_first_is_compared_with_the_first():
+    runs = [
+        replace(rollout(renderer, offroad=harm), log=f"{renderer} {name}")
+        for name, harm in (("log 1", 0.0), ("log 2", 1.0))
+        for renderer in ("clean", "3dgs")
+    ]
+    assert find_flips(run_of(*runs)) == ([], 2)
+    runs[-1] = replace(runs[-1], metrics={"offroad": 0.0})
+    (flip,), _ = find_flips(run_of(*runs))
+    assert (flip.base.log, flip.other.log, flip.tone) == ("clean log 2", "3dgs log 2", "better")
+    first, second = cells_of(run_of(*runs))
+    assert (first.take, first.flips, second.take, second.flips) == (1, (flip,), 0, ())
 
 
 def test_a_drive_that_the_policy_broke_off_is_an_outcome():
