@@ -30,7 +30,7 @@ from alpasim_plugin.control.can_bus import (  # noqa: E402
 )
 from alpasim_plugin.control.can_codec import load_map, open_codec  # noqa: E402
 from alpasim_plugin.control.can_policy import CanPolicy, path_cubic, quantities  # noqa: E402
-from alpasim_plugin.core.types import HeightField, Vehicle  # noqa: E402
+from alpasim_plugin.core.types import EgoState, HeightField, Observation, Vehicle  # noqa: E402
 from tests.control.can_ecu import LaneKeeper, serve  # noqa: E402
 
 
@@ -137,6 +137,21 @@ def test_a_missing_command_is_held_and_then_the_brake_grows(codec, wires):
     assert braking[-1] == STOP_MPS2
     assert [g.wheel_deg for g in got] == pytest.approx([5.0] * len(got))
     assert one.counts["held"] == held
+
+
+def test_the_vehicle_brakes_although_one_of_the_two_commands_still_comes(codec, wires):
+    bus, unit = wires
+    ends = exchange(codec, bus)
+    sender = example(echoes=False)
+    marks = []
+    for t_us in range(0, HOLD_US + 200_000, 50_000):
+        steer, accel = commands(sender, 5.0, 1.0)
+        unit.send(steer)
+        if t_us == 0:
+            unit.send(accel)
+        marks.append(ends.step(t_us, NOTHING).mark)
+    held = HOLD_US // 50_000 + 1
+    assert marks == ["held"] * held + ["ramped"] * (len(marks) - held)
 
 
 def test_without_any_command_the_vehicle_brakes(codec, wires):
@@ -351,6 +366,36 @@ def steady(policy, accel_mps2):
         return False
 
     exchange._wait = wait
+
+
+def pose_at(x_m, y_m, yaw_rad):
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(yaw_rad), -np.sin(yaw_rad)], [np.sin(yaw_rad), np.cos(yaw_rad)]]
+    T[:2, 3] = x_m, y_m
+    return T
+
+
+def test_a_plan_begins_with_the_wheels_of_the_last_one_where_the_ego_is_at_its_end(curve):
+    def observation(ego):
+        return Observation(ego.t_us, {}, {}, ego, curve.ego_log, np.zeros((0, 3)))
+
+    policy = CanPolicy(curve, "virtual:test-next-plan")
+    policy.reset(0, curve.route)
+    steady(policy, 1.0)
+    start = EgoState(1_000_000, pose_at(40.0, -20.0, 2.9), speed_mps=20.0, yaw_rate_radps=1.0)
+    plan = policy.act(observation(start))
+    end_us = start.t_us + curve.rates.policy_us
+    end = int(np.flatnonzero(plan.times_us == end_us)[0])
+    assert plan.xy[end, 1] > 0.05
+    pose = start.T_world_rig @ pose_at(*plan.xy[end], plan.yaw[end])
+    ego = EgoState(end_us, pose, speed_mps=9.0)
+    state = policy._start(observation(ego))
+    assert state.speed_mps == pytest.approx(20.0 + curve.rates.policy_us * 1e-6)
+    assert state.steer_rad > 0.0
+    assert policy._steer_rate < 0.0  # the unit turns the wheels back
+    state = policy._start(observation(replace(ego, T_world_rig=pose @ pose_at(0.0, 0.5, 0.0))))
+    assert (state.speed_mps, state.steer_rad, policy._steer_rate) == (9.0, 0.0, 0.0)
+    policy.close()
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.05, -0.05])
