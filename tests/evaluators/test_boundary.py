@@ -15,6 +15,7 @@ from evaluators.statistics.boundary import (
     Stretch,
     difference_of,
     median_boundary,
+    middles_of_changes,
     next_points,
     seeds_for_median,
     stretches_of,
@@ -70,6 +71,10 @@ def test_points_that_cannot_be_built_widen_the_bracket_and_the_distance():
     assert ends(failed) == [(0, 19, 1), (23, STEPS, 0)]
     assert widest_gap(outcomes(failed)) == 4
     assert widest_gap(outcomes(searched(lambda point: False, skipped={8}))) == 8
+
+
+def test_of_two_middles_the_lower_is_driven():
+    assert middles_of_changes({0: True, 3: False, 8: False, 12: True}, frozenset({10})) == [1, 9]
 
 
 def test_stretches_count_the_seeds_at_points_that_all_have_driven():

@@ -11,7 +11,10 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import derive_seed
 from alpasim_plugin.log.run_folder.records import MetricValue
 from alpasim_plugin.log.run_folder.schema import SUMMARY
-from alpasim_plugin.runs.vary import Sweep, has_failed
+from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.vary import BoundarySearch, Sweep, has_failed
+from evaluators.statistics.boundary import PARTS
+from scenarios.suite import ScenarioRef
 
 DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1", "--images", "none"]
 PLAIN = ["--set", "environment.buildings=0"]
@@ -65,6 +68,36 @@ def test_a_range_without_a_failure_and_points_that_cannot_be_built_are_said(tmp_
     command = ["gate", str(tmp_path / "run"), "--gate", str(gate)]
     assert run_command([*command, "--baseline-file", str(tmp_path / "run")]) == 0
     assert run_command(command) == 2  # one variant, and nothing to compare it with
+
+
+def test_the_record_of_a_search_is_of_the_part_that_can_be_built_and_of_the_variant_minus_its_base():
+    ref = ScenarioRef("hard/cut_in", None, ("environment.buildings=0",))
+    options = RunOptions(baseline="constant-velocity")
+
+    def planned(refs):
+        return make_plan(refs, ["clean"], ["constant-velocity", "pure-pursuit"], [0], options)
+
+    sweep = Sweep.parse("actors.cutter.s_m=35..435/200")
+    search = BoundarySearch(planned([ref]), (sweep,), planned)
+    (part,) = search.reached
+    assert (part.low, part.high) == (35, 235)
+    first = [(step,) for step in part.first]
+    policies = {variant.policy: variant for variant in search.variants}
+    search.failed[policies["constant-velocity"], 0] = dict.fromkeys(first, False)
+    search.failed[policies["pure-pursuit"], 0] = {first[0]: True, **dict.fromkeys(first[1:], False)}
+    record = search.record()
+    assert record["range"] == [35, 435]
+    assert record["reachable"] == [part.low, part.high]
+    assert record["spacing"] == (part.high - part.low) / 2
+    assert record["first"] == [part.values[step] for step in part.first]
+    assert record["grid_rollouts"] == 2 * (2 * PARTS + 1)
+    (difference,) = record["differences"].values()
+    assert (difference["baseline"], difference["gained"], difference["lost"]) == (
+        "clean/constant-velocity",
+        1,
+        0,
+    )
+    assert difference["more"] == pytest.approx(record["spacing"] / 2)
 
 
 @pytest.mark.parametrize(
