@@ -7,9 +7,13 @@ from functools import cache
 from tests.docs import commands
 
 PACKAGES = ("alpasim_plugin", "evaluators", "policies", "scenarios")
+STARTED = (*PACKAGES, "tests", "configs")  # by ``python -m``
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 OF_COMMIT = re.compile(r"`python (docs/scripts/\w+\.py)[^`\n]*`\s+at\s+commit\s+(\w{8})")
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
+PROGRAM = re.compile(r"\bpython3? ([\w./-]+\.py)\b")
+MODULE = re.compile(r"\bpython3? -m ([\w.]+)")
+AT_COMMIT = re.compile(r"\bat\s+commit\s+([0-9a-f]{8})\b")
 HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.M)
 
 
@@ -101,6 +105,41 @@ def files_not_there(repo, pages):
             if not any((root / file).is_file() for root in roots)
         ]
     return missing
+
+
+def programs_of(text):
+    """Return the files of ours that the commands of a text start, as paths below the repository:
+    ``python FILE`` and ``python -m MODULE``; a package stands for its ``__main__``.
+    """
+    paths = [path for path in PROGRAM.findall(text) if "/" in path]
+    modules = [name for name in MODULE.findall(text) if name.split(".")[0] in STARTED]
+    return paths + [f"{name.replace('.', '/')}.py" for name in modules]
+
+
+def programs_by_commit(page):
+    """Yield the programs that a page's commands start, each with the commits that its paragraph
+    names: "at commit" and eight letters.
+    """
+    for paragraph in re.split(r"\n\s*\n", page.read_text(encoding="utf-8")):
+        commits = AT_COMMIT.findall(paragraph)
+        for path in programs_of(paragraph):
+            yield path, commits
+
+
+def programs_not_there(repo, pages):
+    """Return the programs that pages start, that do not exist, and whose paragraph names no commit."""
+    return [
+        f"{page.name}: {path}"
+        for page in pages
+        for path, commits in programs_by_commit(page)
+        if not commits and not is_program(repo, path)
+    ]
+
+
+def is_program(repo, path):
+    """Tell whether a file exists, or the ``__main__`` of the package of that name."""
+    file = repo / path
+    return file.is_file() or (file.with_suffix("") / "__main__.py").is_file()
 
 
 def imports_of_nothing(repo, pages):

@@ -15,6 +15,9 @@ from tests.docs.page_links import (
     broken_links,
     files_not_there,
     imports_of_nothing,
+    is_program,
+    programs_by_commit,
+    programs_not_there,
     reachable,
     unshown,
 )
@@ -68,6 +71,41 @@ def test_studies_that_are_done_are_in_the_commit_that_their_page_names(repo, pag
     if not known or (repo / ".git/shallow").exists():
         pytest.skip("the history of the project is not here")
     assert named == known
+
+
+def test_programs_that_pages_start_are_in_the_tree_or_in_the_commit_that_is_named(repo, pages):
+    assert programs_not_there(repo, pages) == []
+    of_commits = {
+        (path, commits[0])
+        for page in pages
+        for path, commits in programs_by_commit(page)
+        if commits and not is_program(repo, path)
+    }
+    assert of_commits
+    git = ["git", "cat-file", "-e"]
+    missing = {
+        (path, commit)
+        for path, commit in of_commits
+        if run([*git, f"{commit}:{path}"], cwd=repo, stderr=DEVNULL).returncode
+    }
+    if missing == of_commits or (repo / ".git/shallow").exists():
+        pytest.skip("the history of the project is not here")
+    assert missing == set()
+
+
+def test_a_program_that_is_gone_is_named_unless_its_paragraph_names_a_commit(tmp_path):
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "there.py").touch()
+    page = tmp_path / "page.md"
+    page.write_text(
+        "Made by `python -m tests.there` and `python -m torch.distributed.x`.\n\n"
+        "Made by `python -m tests.gone --quick` and `python tools/gone.py`.\n\n"
+        "Made by `python tools/old.py`\nat commit d32adb86.\n"
+    )
+    assert programs_not_there(tmp_path, [page]) == [
+        "page.md: tools/gone.py",
+        "page.md: tests/gone.py",
+    ]
 
 
 def test_every_page_is_reachable_from_the_index(repo):
