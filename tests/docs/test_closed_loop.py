@@ -30,14 +30,37 @@ def test_pages_say_what_the_record_says(closed_loop):
     assert {abs(float(number)) for number in re.findall(NUMBER, row)} <= known
 
 
-def test_the_interval_over_families_is_t_on_the_sums_of_their_residuals(closed_loop):
+def test_over_families_the_difference_is_counted_tested_and_bounded_for_others(closed_loop):
     counts = {"bends": (1, 0), "hills": (4, 0), "towns": (1, 1)}  # of 4 rollouts
     events = {
         family: {"3dgs": [before, 4], "onefixer": [after, 4]}
         for family, (before, after) in counts.items()
     }
-    # -1, -4 and 0 of 4 rollouts: mean -5/12, residuals 2/3, -7/3 and 5/3, t of 2 degrees 4.3027
-    half = 100 * 4.3027 * np.sqrt(3 / 2 * (4 / 9 + 49 / 9 + 25 / 9)) / 12
-    low, high, family, rest = closed_loop.over_families(events)
-    assert (low, high) == pytest.approx((-500 / 12 - half, -500 / 12 + half), rel=1e-4)
-    assert (family, rest) == ("hills", pytest.approx(-12.5))
+    over = closed_loop.over_families(events)
+    assert (over.n_better, over.n_worse, over.p_value) == (2, 0, 0.5)
+    low, high = over.bounds
+    assert -100.0 <= low < -500 / 12 < 0.0 < high, "three families say little of others"
+    assert (over.family, over.without_family) == ("hills", pytest.approx(-12.5))
+
+
+def test_the_bounds_for_other_families_hold_where_one_in_ten_changes_greatly(closed_loop):
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(100):
+        lost = np.where(rng.random(18) < 0.1, 8, 0)
+        events = {str(i): {"3dgs": [int(n), 10], "onefixer": [0, 10]} for i, n in enumerate(lost)}
+        low, high = closed_loop.over_families(events).bounds
+        covered += low <= -8.0 <= high
+    assert covered >= 95
+
+
+def test_a_mean_without_an_interval_says_so(closed_loop):
+    entry = {"mean": 3.0, "ci95": 0.5, "ci95_clustered": None}
+    numbers = closed_loop.numbers_of(entry, ("mean", "ci95", "ci95_clustered"))
+    assert numbers == [3.0, 0.5, None, None]
+    assert [closed_loop.printed(number, 1, ".1f") for number in numbers] == [
+        "3.0",
+        "0.5",
+        "none",
+        "none",
+    ]
