@@ -154,7 +154,12 @@ def read_colmap(folder: Path, need_files: bool = True) -> SourceDrive:
         f"no times: photographs are taken in the order of their names, {1_000_000 // PERIOD_US} a second"
     )
     return SourceDrive(
-        "colmap", real(folder).name, tuple(photographs), front, points=points, notes=tuple(notes)
+        "colmap",
+        real(folder).name,
+        tuple(photographs),
+        front,
+        points=points if len(points) else None,
+        notes=tuple(notes),
     )
 
 

@@ -520,6 +520,14 @@ def test_images_that_do_not_stand_where_their_rig_says_are_refused(tmp_path, bin
         read_source(tmp_path, need_files=False)
 
 
+def test_a_colmap_model_without_points_leaves_them_to_be_found(tmp_path):
+    model = tmp_path / "sparse/0"
+    colmap(model, NAMES)
+    assert len(read_source(tmp_path, need_files=False).points) == 1
+    (model / "points3D.txt").write_text("# no points\n")
+    assert read_source(tmp_path, need_files=False).points is None
+
+
 def test_numbers_behind_the_last_one_of_a_line_of_colmap_are_refused(tmp_path):
     model = tmp_path / "sparse/0"
     colmap(model, NAMES)

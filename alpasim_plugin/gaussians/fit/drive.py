@@ -182,7 +182,7 @@ def _start(
     )
     point_sets = [] if points is None else [points]
     if share < LEAST_MEASURED:
-        if points is None:
+        if points is None or not len(points):
             raise InputError(
                 f"{len(views)} photographs: nothing whose distance they measure",
                 "give points (structure from motion or LiDAR), or photographs that overlap, in order along the way, with their own poses",

@@ -21,7 +21,7 @@ names points to start from: a binary PLY with x, y, z and, if coloured, red, gre
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +154,7 @@ class PosedPhotograph:
             ),
             self.rgb(),
             self.file.stem,
+            t_us=int(self.t_us or 0),
         )
 
 
@@ -258,17 +259,20 @@ def read_points(path: Path) -> GaussianCloud:
 
 
 def resized(view: PosedView, width: int) -> PosedView:
-    """Return a view with another number of pixels, its field of view unchanged; sky, mask and depth
-    are left out.
+    """Return a view with another number of pixels, its field of view unchanged; without sky, mask
+    and depth, which are of single pixels.
     """
     camera = view.camera
     height = round(camera.height * width / camera.width)
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
-    return PosedView(
-        PinholeCamera(width, height, K, camera.T_camera_world),
-        np.asarray(rgb, dtype=np.uint8),
-        view.name,
+    return replace(
+        view,
+        camera=PinholeCamera(width, height, K, camera.T_camera_world),
+        rgb=np.asarray(rgb, dtype=np.uint8),
+        sky=None,
+        mask=None,
+        depth=None,
     )
 
 

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit import dense, drive
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
 from alpasim_plugin.gaussians.fit.lens import balances, gain_near
+from alpasim_plugin.gaussians.fit.photographs import resized
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points, matches
 from alpasim_plugin.gaussians.fit.tracks import Placed, Tracks, corrected, follow, place
@@ -202,6 +205,21 @@ def test_a_held_out_photograph_has_the_gain_of_its_own_camera_s_neighbours(monke
     exposures = drive.fit_drive(train, points, kept=kept).exposures
     assert exposures["front-000001"] == pytest.approx(gains["front"])
     assert exposures["left-000002"] == pytest.approx(gains["left"])
+
+
+def test_photographs_that_measure_nothing_do_not_start_from_no_points(views):
+    blank = [replace(view, rgb=np.zeros_like(view.rgb)) for view in views[:2]]
+    none = cloud_from_points(np.zeros((0, 3)), np.zeros((0, 3)))
+    with pytest.raises(InputError, match="nothing whose distance they measure"):
+        drive.fit_drive(blank, none, recipe=replace(SplatRecipe.street(), steps=1))
+
+
+def test_a_view_of_another_size_keeps_what_is_not_of_single_pixels(views):
+    sky = np.zeros(views[0].rgb.shape[:2], dtype=bool)
+    view = replace(views[0], actors={"car": np.eye(4)}, gain=(1.1, 1.0, 0.9), t_us=7, sky=sky)
+    small = resized(view, 100)
+    assert (small.actors, small.gain, small.t_us) == (view.actors, view.gain, 7)
+    assert (small.name, small.sky, small.rgb.shape[1]) == (view.name, None, 100)
 
 
 def test_a_halved_view_sees_the_same_with_a_quarter_of_the_pixels(views):
