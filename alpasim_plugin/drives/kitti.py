@@ -10,6 +10,7 @@ one.
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -88,18 +89,14 @@ def read_kitti(folder: Path) -> SourceDrive:
         K, T_left_camera = _camera(projections, name, folder / CALIBRATION)
         camera = "left" if name == left else "right"
         numbered = list(zip(rows, files[name], strict=True))
-        posed = [(i, path) for i, path in numbered if i < len(poses)]
-        spare = [path.name for i, path in numbered if i >= len(poses)]
-        for i, path in posed:
+        for i, path in numbered:
+            if i >= len(poses):
+                continue
             lens = Lens(*check_image(read_bytes(path), path), K)
             location = f"{folder}, photograph {i}"
             pose = poses[i] @ T_left_camera
             photographs.append(PosedPhotograph(path, lens, pose, location, times[i], camera, {}))
-        if spare:
-            notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
-        alone = len(poses) - len(posed)
-        if alone:
-            notes.append(f"{name}: {alone} of {len(poses)} poses have no photograph")
+        notes += _unmatched(name, numbered, len(poses))
     others = [name for name in ROWS if name not in files and os.path.isdir(folder / name)]
     if others:
         notes.append(f"not read: {', '.join(others)}")
@@ -113,6 +110,18 @@ def read_kitti(folder: Path) -> SourceDrive:
         metric="the poses, metres",
         notes=tuple(notes),
     )
+
+
+def _unmatched(name: str, numbered: Sequence[tuple[int, Path]], n_poses: int) -> list[str]:
+    """Say which photographs of a camera have no pose, and how many poses have no photograph."""
+    notes = []
+    spare = [path.name for row, path in numbered if row >= n_poses]
+    if spare:
+        notes.append(f"{name}: photographs without a pose are left out: {some_of(spare)}")
+    alone = n_poses - (len(numbered) - len(spare))
+    if alone:
+        notes.append(f"{name}: {alone} of {n_poses} poses have no photograph")
+    return notes
 
 
 def _images(folder: Path) -> list[Path]:

@@ -261,42 +261,59 @@ def _check_properties(header: PlyHeader, element: PlyElement) -> tuple[int, list
     """Return the number of coefficients per channel beyond the constant one, and the properties that
     must have their neutral value.
     """
-    have = set(element.properties)
-    usual = {*_REQUIRED, *_SCALES}
-    missing = [name for name in _REQUIRED if name not in have]
+    names = set(element.properties)
+    location = f"{header.path}, element {element.name!r}"
+    _check_names(names, location)
+    _check_types(element, names, location)
+    neutral = sorted(name for name in names if _neutral_of(name) is not None)
+    return _coefficients_per_channel(names, location), neutral
+
+
+def _check_names(names: set[str], location: str) -> None:
+    """Refuse properties that are missing, unknown, or more than a Gaussian has."""
+    missing = [name for name in _REQUIRED if name not in names]
     if missing:
         raise InputError(
-            f"{header.path}, element {element.name!r}: missing properties {missing}",
+            f"{location}: missing properties {missing}",
             "give a 3DGS PLY, not a mesh or points; read_gaussians also knows compressed PLY",
         )
     PLY.check(
-        [field_name(VERTEX, name) for name in have],
-        f"{header.path}, element {element.name!r}",
+        [field_name(VERTEX, name) for name in names],
+        location,
         "export a plain 3DGS model, of one time and without filters; or leave the properties out if nothing is drawn of them",
     )
-    stray = sorted({name for name in have if re.fullmatch(r"(scale|rot|f_dc)_\d+", name)} - usual)
+    numbered = {name for name in names if re.fullmatch(r"(scale|rot|f_dc)_\d+", name)}
+    stray = sorted(numbered - {*_REQUIRED, *_SCALES})
     if stray:
         raise InputError(
-            f"{header.path}, element {element.name!r}: more numbers than a Gaussian has: {some_of(stray)}",
+            f"{location}: more numbers than a Gaussian has: {some_of(stray)}",
             PLAIN,
         )
-    strange = sorted(name for name in have if _neutral_of(name) is not None)
+
+
+def _check_types(element: PlyElement, names: set[str], location: str) -> None:
+    """Refuse whole numbers where a logit or a logarithm stands."""
     fields = element.dtype or np.dtype([])
-    whole = [name for name in ("opacity", *_SCALES) if name in have and fields[name].kind != "f"]
+    whole = [name for name in ("opacity", *_SCALES) if name in names and fields[name].kind != "f"]
     if whole:
         raise InputError(
-            f"{header.path}, element {element.name!r}: whole numbers as {some_of(whole)}, which are a logit and logarithms",
+            f"{location}: whole numbers as {some_of(whole)}, which are a logit and logarithms",
             "export a plain 3DGS model, with properties of type float",
         )
-    n_rest = sum(name.startswith("f_rest_") for name in have)
+
+
+def _coefficients_per_channel(names: set[str], location: str) -> int:
+    """Return how many coefficients a channel has beyond the constant one, of whole bands."""
+    n_rest = sum(name.startswith("f_rest_") for name in names)
     per_channel, left_over = divmod(n_rest, 3)
-    complete = all(f"f_rest_{i}" in have for i in range(n_rest))
-    if left_over or not complete or math.isqrt(per_channel + 1) ** 2 != per_channel + 1:
+    is_complete = all(f"f_rest_{i}" in names for i in range(n_rest))
+    has_whole_bands = math.isqrt(per_channel + 1) ** 2 == per_channel + 1
+    if left_over or not is_complete or not has_whole_bands:
         raise InputError(
-            f"{header.path}, element {element.name!r}: {n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
+            f"{location}: {n_rest} f_rest properties; a degree L has 3 ((L + 1)^2 - 1): 0, 9, 24, 45, 72",
             "export the file again with whole bands of spherical harmonics",
         )
-    return per_channel, strange
+    return per_channel
 
 
 def _columns(rows: NDArray[np.void], names: Sequence[str]) -> FloatArray:
@@ -424,19 +441,39 @@ def read_ply_header(path: Path | str) -> PlyHeader:
                 )
     if not form:
         raise InputError(f"{path}: no format line", _EXPORT_AGAIN)
-    text = form == "ascii"
+    is_text = form == "ascii"
+    elements = _placed_elements(path, element_rows, None if is_text else body_offset)
+    return PlyHeader(path, elements, tuple(comments), body_offset if is_text else None)
+
+
+def _placed_elements(
+    path: Path,
+    element_rows: Sequence[tuple[str, int, list[tuple[str, str] | None]]],
+    body_offset: int | None,
+) -> tuple[PlyElement, ...]:
+    """Return the elements with where each begins: bytes of the file, or lines of a text's body. What
+    stands behind an element with lists in a binary file has no known place.
+
+    Args:
+        path: For errors.
+        element_rows: Name, number of rows, and properties with their types; None is a list.
+        body_offset: Where the body of a binary file begins; None of a text.
+    """
     elements = []
-    offset: int | None = 0 if text else body_offset
+    is_text = body_offset is None
+    offset = 0 if is_text else body_offset
     for name, rows, fields in element_rows:
         scalars = [field for field in fields if field is not None]
         with parsing(path, _EXPORT_AGAIN, f"element {name!r}"):
             dtype = np.dtype(scalars) if len(scalars) == len(fields) else None
         elements.append(PlyElement(name, rows, dtype, offset))
-        if offset is not None and (text or dtype is not None):
-            offset += rows if dtype is None or text else rows * dtype.itemsize
+        if is_text and offset is not None:
+            offset += rows
+        elif dtype is not None and offset is not None:
+            offset += rows * dtype.itemsize
         else:
             offset = None
-    return PlyHeader(path, tuple(elements), tuple(comments), body_offset if text else None)
+    return tuple(elements)
 
 
 def read_ply_element(header: PlyHeader, name: str) -> NDArray[np.void]:
