@@ -147,8 +147,11 @@ def beside(path: F64, T_world_rig: F64, T_world_camera: F64) -> float:
         >>> beside(np.array([[0.0, 0], [9, 0]]), np.array([[1.0, 0, 0, 4], [0, 1, 0, 2], [0, 0, 1, 0], [0, 0, 0, 1]]), ahead)
         2.0
     """
-    left = project(path, T_world_rig[:2, 3])[1]
-    return left * (project(path, T_world_rig[:2, 3] + leftwards(T_world_camera)[:2])[1] - left)
+    rig = T_world_rig[:2, 3]
+    _, left_of_path_m = project(path, rig)
+    # How far one metre to the camera's left goes to the path's left.
+    _, moved_m = project(path, rig + leftwards(T_world_camera)[:2])
+    return left_of_path_m * (moved_m - left_of_path_m)
 
 
 def line_pixels(image: U8) -> Bool:
