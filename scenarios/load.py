@@ -64,7 +64,7 @@ def load_scenario(
         seed: Scene seed; None takes the file's. Another seed than the file's makes another scene,
             with the seed in its id. Seed 0 is the file as written, but for its ``variations``.
         overrides: ``key=value`` with dotted keys, applied before validation.
-        source: Who reads a recorded log, as `plugins.parts.resolve` takes it; None finds the source
+        source: Who reads a recorded log, as `alpasim_plugin.core.parts.resolve` takes it; None finds the source
             that recognises the path.
 
     Returns:

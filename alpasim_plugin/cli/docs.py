@@ -3,6 +3,7 @@
 import difflib
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,8 @@ Examples:
 - `simrun docs`: all pages, a line each
 
 - `simrun docs policies`: how to put a policy in
+
+- `simrun docs experiments/speed`: a page of a folder
 """
 
 
@@ -40,12 +43,14 @@ def docs(
             f"{FOLDERS[1]}: this installation has no pages",
             "Install the wheel with pip, or use a checkout.",
         )
-    texts = {path.stem: read_text(path) for path in sorted(folder.glob("*.md"))}
+    texts = {}
+    for path in sorted(folder.rglob("*.md"), key=lambda path: (len(path.parts), path)):
+        texts[path.relative_to(folder).with_suffix("").as_posix()] = read_text(path)
     titles = {name: text.partition("\n")[0].removeprefix("# ") for name, text in texts.items()}
     if page is None:
-        show(as_json, titles, *(f"{name:<24}{title}" for name, title in titles.items()))
+        show(as_json, titles, *(f"{name:<32}{title}" for name, title in titles.items()))
         return
-    name = Path(page).stem
+    name = _name_of(page, list(texts))
     if name not in texts:
         near = difflib.get_close_matches(name, texts, 1)
         near = near or [one for one, title in titles.items() if name.lower() in title.lower()]
@@ -60,3 +65,12 @@ def docs(
     console = Console()
     with console.pager(styles=True):
         console.print(Markdown(texts[name]))
+
+
+def _name_of(page: str, names: Sequence[str]) -> str:
+    """Return the name of the page that a word stands for: whole, as a file, or the last part of one
+    page's name alone.
+    """
+    name = page.removeprefix("docs/").removesuffix(".md")
+    same_end = [candidate for candidate in names if Path(candidate).name == Path(name).name]
+    return name if name in names or len(same_end) != 1 else same_end[0]

@@ -131,7 +131,7 @@ class Route:
     """Where the ego should go: a polyline in the world, without time."""
 
     xyz: F64  # (N, 3) metres, world
-    lane_ids: tuple[str, ...] = ()
+    lane_ids: tuple[str, ...] = ()  # lanes that it follows, where the map has them
 
 
 @dataclass(frozen=True)

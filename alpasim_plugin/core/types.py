@@ -76,11 +76,11 @@ class Vehicle:
 class EgoState:
     """True state of the ego at one instant."""
 
-    t_us: int
+    t_us: int  # of the state
     T_world_rig: F64  # (4, 4)
     speed_mps: float  # along rig x; negative in reverse
-    accel_mps2: float = 0.0
-    yaw_rate_radps: float = 0.0
+    accel_mps2: float = 0.0  # along rig x
+    yaw_rate_radps: float = 0.0  # to the left positive
     steer_rad: float = 0.0  # road-wheel angle, left positive
 
 
@@ -137,13 +137,13 @@ class LensModel:
 class CameraSpec:
     """A camera on the rig, a pinhole unless it has a ``lens``."""
 
-    name: str
-    width: int
-    height: int
+    name: str  # in the scenario
+    width: int  # pixels
+    height: int  # pixels
     K: F64  # (3, 3) pixels; of an ftheta lens only the middle counts
     T_rig_camera: F64  # (4, 4)
     shutter_us: int = 0  # rows are exposed one after another, top to bottom, within it; 0: at once
-    lens: LensModel | None = None
+    lens: LensModel | None = None  # None: a pinhole
     interval_us: int = 0  # between frames; 0: the scenario's camera period
 
 
@@ -153,8 +153,8 @@ class SensorSpec:
     rate).
     """
 
-    camera: str
-    interval_us: int = 0
+    camera: str  # its name in the scenario
+    interval_us: int = 0  # between its images; 0: the camera's own
     device: bool = False  # its image as a tensor, see `Observation.image`
 
 
@@ -173,7 +173,7 @@ class RenderRequest:
     """One frame to render."""
 
     t_us: int  # shutter end
-    camera: CameraSpec
+    camera: CameraSpec  # its calibration
     T_world_camera: F64  # (2, 4, 4): at shutter start and at shutter end
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4), only actors present at t_us
     # forecast of this camera's next requests; only for a renderer with `lookahead`
@@ -256,8 +256,8 @@ class Frame:
     video). A frame that was drawn on a device downloads its planes when one is first read.
     """
 
-    t_us: int
-    camera: str
+    t_us: int  # shutter end
+    camera: str  # its name
     rgb: U8 = cast(U8, _Plane())  # (H, W, 3) sRGB
     # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
     alpha: F32 | None = cast(F32 | None, _Plane())
@@ -380,13 +380,15 @@ def shielded(value: Any) -> Any:
 class Observation:
     """What a policy may know at ``t_us``: frames, its own motion so far, and the route ahead."""
 
-    t_us: int
+    t_us: int  # now
     frames: Mapping[str, Frame]  # newest frame per camera it asked for
-    cameras: Mapping[str, CameraSpec]
-    ego: EgoState
+    cameras: Mapping[str, CameraSpec]  # calibration of each camera, by name
+    ego: EgoState  # at t_us
     history: Trajectory  # rig poses in the world up to t_us
     route_rig: F64  # (20, 3) metres, rig frame now; rows of NaN where the route ends
-    images: Mapping[str, Any] = field(default_factory=dict)
+    images: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # images that lie on a device; `image` gives any
 
     def image(self, camera: str) -> Any:
         """Return a camera's image as a tensor ``(H, W, 3)`` uint8 that the policy may change: of
@@ -411,11 +413,12 @@ class Plan:
     itself.
     """
 
-    t_us: int
+    t_us: int  # when it was made
     times_us: I64  # (T,) absolute, strictly increasing, times_us[0] == t_us
     xy: F64  # (T, 2) metres
     yaw: F64  # (T,) radians
     samples: tuple[F64, ...] = ()  # alternatives, each (T, 3): x, y, yaw at times_us
+    # what the policy says of itself; goes to debug.jsonl
     debug: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -507,43 +510,43 @@ STANDING_ID = "obstacle-"
 class Scene:
     """What evaluators may see of a scenario: the map and the human drive, never pixels."""
 
-    scene_id: str
-    lane_map: LaneMap
+    scene_id: str  # its name
+    lane_map: LaneMap  # lanes, edges and signals
     ego_log: Trajectory  # recorded rig poses (rear axle on the ground), world
-    vehicle: Vehicle
+    vehicle: Vehicle  # the ego's size and axles
     # the same road as AlpaSim's own loader reads it, where that differs
     alpasim_map: LaneMap | None = None
-    standing: Standing = "known"
+    standing: Standing = "known"  # all that stands there is among the actors, or it was found
     # (N, 3) metres, world: the lane behind the recorded drive, as far as a rollout may go
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
-    path_end: PathEndKind = "record"
+    path_end: PathEndKind = "record"  # what the end of the path is
 
 
 @dataclass(frozen=True)
 class Scenario:
     """A complete test case, the same type for every source."""
 
-    scene_id: str
+    scene_id: str  # its name
     source: str  # yaml | argoverse | commonroad | drive | osi | usdz
     seed: int  # scene seed: geometry, textures, scripted actors
-    lane_map: LaneMap
-    ground: HeightField
+    lane_map: LaneMap  # lanes, edges and signals
+    ground: HeightField  # height of the ground
     ego_log: Trajectory  # rig poses, world
-    vehicle: Vehicle
-    route: Route
-    actors: tuple[Actor, ...]
+    vehicle: Vehicle  # the ego's size and axles
+    route: Route  # that the policy is given
+    actors: tuple[Actor, ...]  # other road users
     cameras: tuple[CameraSpec, ...]  # however they are listed: ahead first, wide first, by name
-    rates: Rates
+    rates: Rates  # periods of cameras, policy and control
     start_us: int  # first frame; the log before it is context
-    end_us: int
+    end_us: int  # last instant of a rollout
     warmup_us: int  # the log is forced until start_us + warmup_us
-    latency: Latency
-    environment: Environment
-    degradation: Degradation
-    background: BackgroundFile | None = None
+    latency: Latency  # from an observation to its plan taking effect
+    environment: Environment  # what stands around the road, and the weather
+    degradation: Degradation  # how `3dgs` differs from the scene as built
+    background: BackgroundFile | None = None  # trained Gaussians that are shown; None: built
     # what was subtracted from the source's coordinates, metres
     world_origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    content_hash: str = ""
+    content_hash: str = ""  # digest of all that a rollout can depend on
     notes: tuple[str, ...] = ()  # what the loader left out or assumed; goes to run.json
     # the same road as AlpaSim's own loader reads it, where that differs
     alpasim_map: LaneMap | None = None
@@ -551,16 +554,14 @@ class Scenario:
     # key of the scenario file -> (as written, as drawn by the seed)
     varied: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
     recording: tuple[Photograph, ...] = ()  # the drive's photographs, of an imported drive
-    model: str | None = (
-        # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and
-        # `clean` is refused
-        None
-    )
-    standing: Standing = "known"
+    # folder of the reconstruction fitted to them, which 3dgs shows; then nothing was built and
+    # `clean` is refused
+    model: str | None = None
+    standing: Standing = "known"  # all that stands there is among the actors, or it was found
     # (N, 3) metres, world: the lane behind the recorded drive, as far as the fastest admissible drive
     # comes; empty where nothing is known there
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
-    path_end: PathEndKind = "record"
+    path_end: PathEndKind = "record"  # what the end of the path is
     stop_at_path_end: bool = True  # see `alpasim_plugin.core.path_end`
     # what the loader read beside the scenario file: path -> digest of the content
     files: Mapping[str, str] = field(default_factory=dict)
@@ -638,22 +639,22 @@ class LoggedImage:
 class RolloutLog:
     """One rollout as evaluators see it, whoever wrote the log."""
 
-    scene_id: str
-    session_uuid: str
-    ego_box: Box
+    scene_id: str  # of the scenario
+    session_uuid: str  # of the rollout
+    ego_box: Box  # size of the ego
     T_rig_box: F64  # (4, 4) pose of the box centre in the rig frame
     ego: Trajectory  # box centre, world
     actors: Mapping[str, Actor]  # ego excluded; track = logged poses of the box centre
-    plans: tuple[LoggedPlan, ...]
-    images: tuple[LoggedImage, ...]
+    plans: tuple[LoggedPlan, ...]  # in the order of their queries
+    images: tuple[LoggedImage, ...]  # that the policy received
     ego_log: Trajectory  # recorded rig poses, world
     start_us: int  # first recorded rig pose
-    render_start_us: int
-    force_gt_us: int
-    control_us: int
-    seed: int = 0
-    info: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    render_start_us: int  # first frame
+    force_gt_us: int  # until then the recorded poses are driven
+    control_us: int  # period of the control steps
+    seed: int = 0  # of the rollout
+    info: Mapping[str, Any] = field(default_factory=dict)  # facts that the writer stored besides
+    warnings: tuple[str, ...] = ()  # what the reader noticed
 
 
 @dataclass(frozen=True)
@@ -662,7 +663,7 @@ class MetricSeries:
     invalid, a reason.
     """
 
-    metric: MetricInfo
+    metric: MetricInfo  # what it is
     t_us: I64  # (T,)
     value: F64  # (T,); NaN where invalid
     valid: Bool  # (T,)

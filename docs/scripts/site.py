@@ -35,10 +35,15 @@ if (location.protocol === "file:") window.Worker = class extends EventTarget {
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return the text of a page: of the home page that of the README, its links from ``docs/``."""
+    """Return the text of a page: of the home page that of the README, its links from ``docs/``,
+    followed by the list of all pages.
+    """
     if page.file.src_uri != "index.md":
         return markdown.replace("](../README.md", "](index.md")
-    return (REPO / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
+    readme = (REPO / "README.md").read_text(encoding="utf-8")
+    home = readme.replace("](docs/index.md", "](#pages").replace("](docs/", "](")
+    pages = markdown.replace("# Pages\n", "## Pages\n", 1).replace("](../README.md", "](index.md")
+    return f"{home}\n{pages}"
 
 
 def on_post_page(output: str, **_: Any) -> str:

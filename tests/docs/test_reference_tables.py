@@ -72,3 +72,30 @@ def test_every_list_of_fields_in_the_code_is_on_the_page(repo, tables):
                 module = ".".join(path.relative_to(repo).with_suffix("").parts)
                 fields = getattr(importlib.import_module(module), name)
                 assert fields in tables.FORMATS, f"{module}.{name} is missing in FORMATS"
+
+
+def test_the_page_of_the_api_is_that_of_the_code(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
+    for path, text in importlib.import_module("api_reference").written().items():
+        stale = f"{path.name} is stale: run python docs/scripts/api_reference.py"
+        assert path.read_text(encoding="utf-8") == text, stale
+
+
+def test_the_rollout_by_hand_of_the_api_page_runs(repo, capsys):
+    page = (repo / "docs" / "api.md").read_text()
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.S | re.M)
+    block = block.replace(
+        '"smoke/curve"', '"smoke/curve", overrides=["timing.duration_us=1000000"]'
+    )
+    exec(compile(block.replace('"lane-camera"', '"constant-velocity"'), "api.md", "exec"), {})
+    assert 0.0 <= float(capsys.readouterr().out) <= 1.0
+
+
+def test_every_environment_variable_of_ours_is_on_a_page(repo):
+    page = (repo / "docs" / "install.md").read_text()
+    variables = set()
+    for folder in ("alpasim_plugin", "evaluators", "policies", "scenarios"):
+        for path in (repo / folder).rglob("*.py"):
+            variables |= set(re.findall(r'"(SIMRUN_[A-Z_]+)"', path.read_text()))
+    assert variables
+    assert sorted(name for name in variables if f"`{name}`" not in page) == []

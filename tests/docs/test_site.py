@@ -8,8 +8,12 @@ from tests.docs.page_links import LINK, without_code
 
 
 def test_the_home_page_is_the_readme_and_its_links_lead_to_pages(repo):
-    text = on_page_markdown("", SimpleNamespace(file=SimpleNamespace(src_uri="index.md")))
+    pages = (repo / "docs" / "index.md").read_text()
+    text = on_page_markdown(pages, SimpleNamespace(file=SimpleNamespace(src_uri="index.md")))
     assert text.startswith("# simrun")
     links = [link for link in LINK.findall(without_code(text)) if not re.match(r"[a-z]+:", link)]
     assert links
+    assert "#pages" in links
+    assert text.count("\n## Pages\n") == 1
+    links = [link for link in links if link != "#pages"]
     assert [link for link in links if not (repo / "docs" / link.split("#")[0]).is_file()] == []
