@@ -6,7 +6,7 @@ a DBC. Nothing of a frame is trusted before all checks have passed.
 """
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -281,10 +281,13 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
         try:
             if isinstance(part, Sent):
                 frame = trial.encode(part, dict.fromkeys(part.signals.values(), 0.0))
+                zeros = list(part.signals)
             else:
                 frame = trial.encode_command(part, 0.0)
                 trial.decode(part, bytes(frame.data))
+                zeros = [part.signal]
             codec.message(part.message).decode(bytes(frame.data))
+            _check_zeros(codec.message(part.message), zeros, bytes(frame.data))
         except Exception as refusal:  # the library raises errors of many kinds
             raise InputError(
                 f"{location}: it cannot be sent as the map says: {type(refusal).__name__}: {refusal}",
@@ -295,6 +298,20 @@ def open_codec(can_map: CanMap, database: Path) -> Codec:
     _check_echoes(codec, database)
     codec.notes = DBC.notes(_met(codec))
     return codec
+
+
+def _check_zeros(message: Any, names: Sequence[str], data: bytes) -> None:
+    """Refuse signals that cannot hold 0: what is at rest would be sent as something else.
+
+    Raises:
+        ValueError: Names the first of them, and what it holds.
+    """
+    values = message.decode(data, decode_choices=False)
+    for name in names:
+        signal = message.get_signal_by_name(name)
+        if abs(float(values[name])) > abs(float(signal.scale)) / 2:
+            low, high = _range(signal)
+            raise ValueError(f"signal {name} holds {low:g} to {high:g}, and not 0")
 
 
 def _check_echoes(codec: Codec, database: Path) -> None:
@@ -334,9 +351,15 @@ def is_fd(message: Any) -> bool:
 
 
 def _start_value(signal: Any) -> float:
-    """Return the value of a signal that nobody sets (``GenSigStartValue``, a raw value)."""
+    """Return the value of a signal that nobody sets (``GenSigStartValue``, a raw value).
+
+    It may lie outside of the signal's range, where databases put what says that nothing is known.
+    """
     raw = 0 if signal.raw_initial is None else signal.raw_initial
-    return _carried(signal, float(raw * signal.scale + signal.offset))
+    if signal.is_float:
+        return float(raw * signal.scale + signal.offset)
+    first, last = _raw_range(signal)
+    return float(min(max(raw, first), last) * signal.scale + signal.offset)
 
 
 def _carried(signal: Any, wanted: float) -> float:

@@ -138,6 +138,14 @@ def test_signals_that_a_map_does_not_name_have_the_start_value_of_the_database(t
         assert sent["SPEED"] == pytest.approx(36.0)
 
 
+def test_a_start_value_beyond_the_range_of_its_signal_is_sent_as_it_is(tmp_path):
+    """Databases put "not known" there."""
+    starts = STARTS.replace("TEMP 60", "TEMP 255")
+    more = ('VALID : 16|1@1+ (1,0) [0|1] "" ECU', 'TEMP : 24|8@1+ (1,-40) [-40|100] "" ECU')
+    codec, _ = opened(tmp_path, message(257, "EGO", 4, SPEED, *more), CMD, starts)
+    assert codec.encode(codec.map.send[0], {"speed_kph": 36.0}).data[3] == 255
+
+
 TWO = message(
     257,
     "EGO",
@@ -154,6 +162,14 @@ TWO = message(
         ((message(257, "EGO", 4, SPEED.replace("(0.01,0)", "(0,0)")), CMD), {}, "EGO"),
         ((message(257, "EGO", 1, SPEED), CMD), {}, "EGO"),
         ((EGO, CMD), {"steer": "{message: CMD, signal: WHEEL}"}, "WHEEL"),
+        (
+            (message(257, "EGO", 4, 'SPEED : 0|11@1+ (0.005,-1000) [0|2047] "" ECU'), CMD), {},
+            "SPEED holds -1000 to -989.765, and not 0",
+        ),
+        (
+            (EGO, message(512, "CMD", 4, ANGLE, 'ACCEL : 16|8@1+ (1,1) [1|200] "" SIM')), {},
+            "ACCEL holds 1 to 200, and not 0",
+        ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_sent_is_refused_when_the_map_is_opened(tmp_path, parts, keys, found):
