@@ -1,7 +1,7 @@
 """``simrun score``: score rollout logs again without rendering."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +11,7 @@ from alpasim_plugin.cli.options import Evaluators, Json
 from alpasim_plugin.cli.output import Progress, first_screen, report_lines, show, warn
 from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.runs.score import ScoreResult, execute_score
 from alpasim_plugin.runs.score_logs import KnownScenes, find_logs
 from evaluators import preset as find_preset
@@ -71,7 +72,13 @@ def score(
     paths = find_logs(logs)
     parts = resolve_evaluators(evaluators)
     results: dict[str, ScoreResult] = {}
+    odd: dict[str, None] = {}  # what is odd about logs, each line once
     with Progress(as_json) as progress:
+
+        def done(manifest: Manifest) -> None:
+            progress.rollout_done(manifest, reused=False)
+            odd.update(dict.fromkeys(manifest.warnings or ()))
+
         for name, choice in chosen.items():
             preset_settings = own_settings[name]
             progress.add_task(name, total=len(paths))
@@ -83,7 +90,7 @@ def score(
                 parts,
                 out if out is None or is_alone else out / name,
                 ["simrun", *sys.argv[1:]],
-                lambda manifest: progress.rollout_done(manifest, reused=False),
+                done,
                 progress.noticed,
             )
     code = worst_code([result.exit_code for result in results.values()])
@@ -92,6 +99,7 @@ def score(
     if is_alone:
         (facts,) = documents.values()
     if not as_json:
+        _warn_of_odd_logs(tuple(odd))
         for result in results.values():
             _warn_of_failures(result.summary)
     has_protocol = any(choice.protocol for choice in chosen.values())
@@ -112,6 +120,14 @@ def _result_lines(results: Mapping[str, ScoreResult], has_protocol: bool) -> lis
     if len(results) > 1 or has_protocol:
         lines.append(render_presets({name: result.summary for name, result in results.items()}))
     return lines
+
+
+def _warn_of_odd_logs(lines: Sequence[str]) -> None:
+    """Warn of logs that end early or have fields of a newer version."""
+    for line in lines[:SHOWN_FAILURES]:
+        warn(line)
+    if len(lines) > SHOWN_FAILURES:
+        warn(f"{len(lines) - SHOWN_FAILURES} more lines of this kind stand in manifest.json")
 
 
 def _warn_of_failures(summary: Summary) -> None:

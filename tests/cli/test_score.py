@@ -96,6 +96,18 @@ def test_a_log_of_ours_scores_as_its_run_did(our_run, tmp_path, capsys):
     assert json.loads((out / "summary.json").read_text())["exit_code"] == 0
 
 
+def test_fields_of_a_newer_version_of_the_log_are_said(our_run, tmp_path, capsys):
+    log = tmp_path / "a" / "rollout.asl"
+    log.parent.mkdir()
+    newer = b"\xfa\x3e\x02\x08\x01"  # an entry that is field 1007
+    source = sorted(our_run.rglob("rollout.asl"))[0]
+    log.write_bytes(source.read_bytes() + len(newer).to_bytes(4, "big") + newer)
+    out = str(tmp_path / "scored")
+    assert run_command(["score", str(log), "--scene", "smoke/straight", "--out", out]) == 0
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "rollout log: not read are LogEntry/field 1007 (1)" in printed
+
+
 @pytest.mark.slow
 def test_several_presets_stand_side_by_side_and_say_what_is_missing(our_run, tmp_path, capsys):
     out = tmp_path / "scored"
