@@ -40,7 +40,7 @@ IN_MEMORY = {"io.BytesIO", "io.StringIO", "pa.BufferReader"}
 WRITING = re.compile(r"^[wax]")
 # Module and function -> why what it opens is in no record.
 UNRECORDED = {
-    "alpasim_plugin.core.cores._lines": "what the system says of this process",
+    "alpasim_plugin.core.cores.system_lines": "what the system says of this process",
     "alpasim_plugin.core.files.lock.one_writer": "a lock file",
     "alpasim_plugin.core.files.reading.open_regular": "it is the reader",
     "alpasim_plugin.core.parts.blame.__init__": "the note of a worker, which it makes",

@@ -27,7 +27,7 @@ def usable_cores(groups: Path = GROUPS, own_groups: Path = OWN_GROUPS) -> int:
 
 def _shares(groups: Path, own_groups: Path) -> Iterator[float]:
     """Yield how many cores' time each control group of this process has, where it is limited."""
-    for line in _lines(own_groups):
+    for line in system_lines(own_groups):
         _, controllers, place = line.split(":", 2)
         is_second_version = controllers == ""
         if not is_second_version and CONTROLLER not in controllers.split(","):
@@ -53,13 +53,13 @@ def _mounted(groups: Path, controllers: str) -> Path:
 def _words(folder: Path, is_second_version: bool) -> list[str]:
     """Return quota and period of a group, in microseconds; another word for no limit."""
     names = ("cpu.max",) if is_second_version else ("cpu.cfs_quota_us", "cpu.cfs_period_us")
-    return " ".join(line for name in names for line in _lines(folder / name)).split()
+    return " ".join(line for name in names for line in system_lines(folder / name)).split()
 
 
-def _lines(path: Path) -> list[str]:
+def system_lines(path: Path) -> list[str]:
     """Return the lines of a file that the system makes; none where it is not there."""
     try:
-        with path.open(encoding="utf-8") as stream:
+        with path.open(encoding="utf-8", errors="replace") as stream:
             return stream.read().splitlines()
     except OSError:
         return []

@@ -6,9 +6,11 @@ stays one document. In a run it also goes to a file beside the rollout's log.
 """
 
 import contextlib
+import ctypes
 import io
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -16,8 +18,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
+from alpasim_plugin.core.cores import system_lines
+
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing from the working directory
 OURS = "simrun"  # our value of it
+SET_CHILD_SUBREAPER = 36  # of prctl(2)
 ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 MOST_BYTES = 4 << 20  # of one rollout, and of what is printed outside of them
 LEFT_OUT = "\n(the rest is left out)\n"
@@ -62,14 +67,55 @@ def forget_safe_path() -> None:
         del os.environ[SAFE_PATH]
 
 
+def lead_group() -> None:
+    """Make this worker the leader of a process group, so that what parts start in it ends with it
+    (`end_group`); on Linux a process whose own parent has ended stays its child as well.
+    """
+    if not hasattr(os, "setpgid"):
+        return
+    os.setpgid(0, 0)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def end_group(leader: int) -> None:
+    """End what is left of the process group of a worker, the worker itself included."""
+    if hasattr(os, "killpg"):
+        with contextlib.suppress(OSError):  # nothing is left of it
+            os.killpg(leader, signal.SIGKILL)
+
+
+def end_descendants() -> None:
+    """End all processes that this one has started, and those that they have started; on Linux."""
+    parents = dict(_processes())
+    line = [os.getpid()]
+    while line:
+        parent = line.pop()
+        children = [pid for pid, its_parent in parents.items() if its_parent == parent]
+        line += children
+        for pid in children:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                os.kill(pid, signal.SIGKILL)
+
+
+def _processes() -> Iterator[tuple[int, int]]:
+    """Yield the processes of this machine, each with its parent, where the system lists them."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        facts = "".join(system_lines(folder / "stat")).rpartition(")")[2].split()
+        if facts:  # else it has ended meanwhile
+            yield int(folder.name), int(facts[1])
+
+
 def end_with_parent() -> None:
-    """End this worker process as soon as its parent is gone, however that ended."""
+    """End this worker process, and its group, as soon as its parent is gone, however that ended."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
 
     def watch() -> None:
         parent.join()
+        if hasattr(os, "getpgrp") and os.getpgrp() == os.getpid():
+            end_group(os.getpid())
         os._exit(ORPHANED)
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()

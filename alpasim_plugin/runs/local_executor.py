@@ -30,7 +30,14 @@ from alpasim_plugin.core.errors import InfrastructureError, InternalError, Simru
 from alpasim_plugin.core.parts.blame import Culprit, Note, note_in
 from alpasim_plugin.core.parts.patches import watch_code
 from alpasim_plugin.core.printing import warn
-from alpasim_plugin.core.subprocesses import end_with_parent, forget_safe_path, safe_path
+from alpasim_plugin.core.subprocesses import (
+    end_descendants,
+    end_group,
+    end_with_parent,
+    forget_safe_path,
+    lead_group,
+    safe_path,
+)
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -265,13 +272,24 @@ class _Worker:
     def left_within(self, seconds: float) -> bool:
         """Tell whether the process ends within a time."""
         self._process.join(max(seconds, 0.0))
-        return self._process.exitcode is not None
+        if self._process.exitcode is None:
+            return False
+        self._end_group()
+        return True
 
     def end(self) -> None:
-        """End the process, whatever it does: a stopped process heeds no other signal."""
+        """End the process, whatever it does, and what parts have started in it: a stopped process
+        heeds no other signal.
+        """
         self._process.kill()
         self._process.join()
+        self._end_group()
         self.connection.close()
+
+    def _end_group(self) -> None:
+        """End what parts have started in the process and left behind."""
+        if self._process.pid is not None:
+            end_group(self._process.pid)
 
 
 class _Pool(Generic[J, R]):
@@ -440,6 +458,7 @@ def _serve(connection: Connection, note: Path) -> None:
     and ends with its parent.
     """
     forget_safe_path()
+    lead_group()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     note_in(note)
@@ -464,6 +483,7 @@ def _serve(connection: Connection, note: Path) -> None:
         except OSError:  # the part has closed the connection too
             os._exit(UNREACHABLE)
     end_children()
+    end_descendants()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()

@@ -139,3 +139,59 @@ def test_workers_end_when_their_parent_is_killed(tmp_path, repo, threads):
     ):
         assert time.monotonic() < until, "a worker outlives its parent"
         time.sleep(0.02)
+
+
+def leave_a_process(item):
+    """Leave a process that sleeps, as the item says, and return its number; with a path, write it
+    there and die.
+    """
+    receiver, sender = os.pipe()
+    child = os.fork()
+    if child == 0:
+        if item == "session":
+            os.setsid()
+        if item == "orphan" and os.fork():
+            os._exit(0)
+        os.write(sender, str(os.getpid()).encode())
+        while True:
+            time.sleep(3600)
+    left = int(os.read(receiver, 32))
+    if os.path.isabs(item):
+        with Path(item).open("a") as numbers:
+            print(left, file=numbers)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return left
+
+
+def is_running(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    return state != "Z"
+
+
+def is_gone(process):
+    until_s = time.monotonic() + 60.0
+    while is_running(process) and time.monotonic() < until_s:
+        time.sleep(0.02)
+    return not is_running(process)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it finds processes in /proc")
+def test_what_a_job_leaves_running_ends_with_its_worker():
+    items = ["child", "session", "orphan"]
+    left = dict(run_jobs(leave_a_process, items, 1, parts_of=lambda item: "mine.py:Leaves"))
+    assert sorted(left) == sorted(items)
+    assert all(map(is_gone, left.values()))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it finds processes in /proc")
+def test_what_a_job_leaves_running_ends_with_a_worker_that_dies(tmp_path):
+    numbers = tmp_path / "numbers"
+    ((_, lost),) = run_jobs(leave_a_process, [str(numbers)], 1, limit_s=60.0)
+    assert isinstance(lost, Lost)
+    left = [int(line) for line in numbers.read_text().split()]
+    assert left
+    assert all(map(is_gone, left))
