@@ -39,7 +39,7 @@ class MetricInfo:
         curve: Place among the curves over time that a viewer shows first, from 1; 0: only when
             asked for.
         cap: How much of a scene's distance counts in a verdict; None: 40 margins of a difference.
-        event: Flag of what lies beyond the cap: a distance is no worse only together with it.
+        event: Flag of what lies beyond the cap, about which a verdict on the distance says nothing.
     """
 
     unit: str

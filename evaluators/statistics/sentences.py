@@ -65,6 +65,8 @@ def claim_text(entry: Difference, metric: MetricInfo) -> str:
     if entry.beyond.n:
         centre = printed(metric, entry.cut_mean, sign=True)[0]
         text += f", {centre}\u00a0{metric.unit}".rstrip("\u00a0")
+    if metric.event:
+        text += f", {metric.event} about what lies beyond"
     return f"{text}; {beyond_text(to_json(entry.beyond))}"
 
 

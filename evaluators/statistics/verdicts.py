@@ -99,7 +99,7 @@ def verdict(bounds: Bounds | None, p: float | None, margin: float, direction: Di
     Non-inferior: the whole interval is better than ``margin`` worse. Worse: the whole interval is
         more than ``margin`` worse, and the test
     of no difference rejects too (p < 0.05). Undecided: neither. A metric without a better side
-    needs a margin, and a change to either side counts as worse. If the bounds hold the guarded ones
+    needs a margin, and a change to either side counts as worse. If the bounds are those of a claim
     (`evaluators.statistics.bounded`), each answer is wrong in at most 2.5 % of runs, also where a
     few scenes differ greatly and none was drawn (docs/experiments/verdict-error.md).
 

@@ -9,6 +9,7 @@ from evaluators import METRICS, paired
 from evaluators.results import Beyond, CellCounts, SceneCounts
 from evaluators.statistics.differences import difference_bounds
 from evaluators.statistics.paired import compare
+from evaluators.statistics.sentences import difference_text
 from evaluators.statistics.verdicts import holm, sign_flip, verdict
 from tests.evaluators.rollout_rows import rows_of
 
@@ -255,6 +256,9 @@ def test_a_claim_about_a_distance_is_about_the_mean_cut_at_its_cap_and_counts_wh
     assert far.beyond == Beyond(
         "worse by more than 4 m", 1, 150, pytest.approx(stats.beta.ppf(0.95, 2, 149))
     )
+    text = difference_text(far, METRICS.info("lateral_distance_m")).replace("\u00a0", " ")
+    assert "the verdict is about the mean cut at 4 m, +0.0267 m, left_route about what" in text
+    assert "1 of 150 scenes worse by more than 4 m, of others at most 3.1 %" in text
     either = pair(base, [[-40.0]] + [[1.0]] * 149, "lateral_bias_m")
     assert (either.beyond.event, either.beyond.n) == ("different by more than 4 m", 1)
     better = pair([[41.0]] + [[1.0]] * 149, base, "lateral_distance_m")
