@@ -18,7 +18,9 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import real
 from alpasim_plugin.core.files.config import (
     Document,
+    Key,
     apply_overrides,
+    apply_values,
     dotted,
     override_locations,
     validate,
@@ -87,9 +89,7 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Scen
     located = override_locations(as_read, overrides)
     ids = {str(i): actor.id for i, actor in enumerate(written.actors)}
     fixed = frozenset(
-        _by_id(".".join(map(str, (*loc, *below))), ids)
-        for loc, value in located
-        for below in _paths_below(value)
+        _with_id((*loc, *below), written) for loc, value in located for below in _paths_below(value)
     )
     kept = [
         f"{key}={json.dumps(value)}"
@@ -98,8 +98,7 @@ def draw(document: Document, seed: int | None, overrides: Sequence[str]) -> Scen
     ]
     document = apply_overrides(document, kept, origin="variation")
     # A variation of a whole section leaves what the user set in it.
-    again = [f"{'.'.join(map(str, loc))}={json.dumps(value)}" for loc, value in located]
-    document = apply_overrides(document, again)
+    document = apply_values(document, _lasting(located))
     spec = validate(ScenarioSpec, document)
     _check_actors(document, spec)
     if spec.seed != AS_WRITTEN:
@@ -230,8 +229,27 @@ def _and_above(key: str) -> set[str]:
     return {".".join(parts[:n]) for n in range(1, len(parts) + 1)}
 
 
+def _lasting(located: Sequence[tuple[Key, Any]]) -> list[tuple[Key, Any]]:
+    """Return the values that no later one replaces, itself or with the section that holds it."""
+    return [
+        (loc, value)
+        for n, (loc, value) in enumerate(located)
+        if not any(loc[: len(later)] == later for later, _ in located[n + 1 :])
+    ]
+
+
+def _with_id(loc: Key, spec: ScenarioSpec) -> str:
+    """Write a key path with dots, and an actor by its id."""
+    parts = [*loc]
+    index = parts[1] if len(parts) > 1 and parts[0] == "actors" else None
+    if isinstance(index, int) and index < len(spec.actors):  # else a later value took it away
+        parts[1] = spec.actors[index].id
+    return ".".join(map(str, parts))
+
+
 def _by_id(key: str, ids: dict[str, str]) -> str:
-    """Write ``actors.0.s_m`` as ``actors.lead.s_m``."""
+    """Write ``actors.0.s_m`` as ``actors.lead.s_m``, unless an actor has the id ``0``."""
     head, _, below = key.partition(".")
     item, _, tail = below.partition(".")
-    return f"actors.{ids[item]}.{tail}" if head == "actors" and item in ids else key
+    is_index = head == "actors" and item in ids and item not in ids.values()
+    return f"actors.{ids[item]}.{tail}" if is_index else key

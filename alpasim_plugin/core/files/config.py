@@ -282,11 +282,27 @@ def apply_overrides(
                 f"{location}: no KEY=VALUE", "write for example --set road.lane_width_m=3.2"
             )
         loc = _assign(data, key.strip().split("."), value_of(value, location), location)
-        marks = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
-        for n in range(1, len(loc)):
-            marks.setdefault(loc[:n], Mark(location, 0, 0))
-        marks[loc] = Mark(location, 0, 0)
+        marks = _marked(marks, loc, location)
     return Document(data, marks, document.path)
+
+
+def apply_values(document: Document, located: Sequence[tuple[Key, Any]]) -> Document:
+    """Set values at key paths, as `override_locations` gives them."""
+    data = copy.deepcopy(document.data)
+    marks = dict(document.marks)
+    for loc, value in located:
+        location = f"--set {dotted(loc)}={json.dumps(value)}"
+        marks = _marked(marks, _assign(data, loc, copy.deepcopy(value), location), location)
+    return Document(data, marks, document.path)
+
+
+def _marked(marks: Mapping[Key, Mark], loc: Key, location: str) -> dict[Key, Mark]:
+    """Return marks in which a key, and those above it that have none, are where a value was set."""
+    changed = {other: mark for other, mark in marks.items() if other[: len(loc)] != loc}
+    for n in range(1, len(loc)):
+        changed.setdefault(loc[:n], Mark(location, 0, 0))
+    changed[loc] = Mark(location, 0, 0)
+    return changed
 
 
 def value_of(text: str, location: str) -> Any:
@@ -317,13 +333,15 @@ def override_locations(document: Document, overrides: Sequence[str]) -> list[tup
     return assignments
 
 
-def _assign(data: Any, keys: list[str], value: Any, location: str) -> Key:
-    """Set a dotted key in place; return its path."""
+def _assign(data: Any, keys: Sequence[str | int], value: Any, location: str) -> Key:
+    """Set a key in place; return its path. Of a list, text names an item by its id, or by its index
+    where no item has that id, and a number is the index.
+    """
     loc: Key = ()
     node = data
     for n, key in enumerate(keys, 1):
         step: Any = key
-        if isinstance(node, list):
+        if isinstance(node, list) and not isinstance(key, int):
             ids = [item.get("id") if isinstance(item, dict) else None for item in node]
             if key in ids:
                 step = ids.index(key)
@@ -332,11 +350,11 @@ def _assign(data: Any, keys: list[str], value: Any, location: str) -> Key:
             else:
                 choices = ", ".join(str(name) for name in ids if name) or f"0..{len(node) - 1}"
                 raise InputError(f"{location}: no list item {key!r}", f"use one of: {choices}")
-        elif not isinstance(node, dict):
+        elif not isinstance(node, dict | list):
             raise InputError(
                 f"{location}: {dotted(loc)} holds a value, not keys", "shorten the path"
             )
-        elif n < len(keys):
+        elif isinstance(node, dict) and n < len(keys):
             node.setdefault(key, {})
         loc = (*loc, step)
         if n < len(keys):
