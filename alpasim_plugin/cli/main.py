@@ -167,6 +167,11 @@ class Verb(TyperCommand):
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         """Parse the words of the verb by its own command."""
         command = load_verb(str(self.name))
+        if any(word == "" or re.fullmatch("--[a-z-]+=", word) for word in args):
+            raise InputError(
+                f"simrun {self.name}: a word, or the value of an option, is empty",
+                "Leave it out, or name what is meant ('.' for this folder); a variable of the shell may not be set.",
+            )
         # Of an option that takes one value and stands twice, the last would win.
         options = [one for one in command.params if isinstance(one, TyperOption)]
         for option in options:

@@ -224,10 +224,9 @@ def parse_seeds(text: str) -> list[int]:
     Raises:
         InputError: Not a positive count nor a list of non-negative integers of 63 bits.
     """
-    try:
-        values = [int(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        values = []
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    is_whole = all(re.fullmatch("[0-9]+", part) for part in parts)
+    values = [int(part) for part in parts] if is_whole else []
     if "," not in text and len(values) == 1 and values[0] > 0:
         SEEDS.check(values[0], f"--seeds {text}")
         return list(range(values[0]))

@@ -257,7 +257,9 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
     assert parse_seeds(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["-1", "", "x", "1,-2", "1.5", f"0,{2**63}"])
+@pytest.mark.parametrize(
+    "text", ["-1", "", "x", "1,-2", "1.5", f"0,{2**63}", "+2", "1_0", "1, 1_0"]
+)
 def test_other_seeds_are_refused(text):
     with pytest.raises(InputError):
         parse_seeds(text)

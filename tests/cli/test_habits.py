@@ -78,6 +78,16 @@ def test_a_comma_where_no_list_stands_is_named(line, capsys):
 
 
 @pytest.mark.parametrize(
+    "words", [["--out", ""], ["--out="], ["--renderer", "clean", ""], ["gate", "run", "--gate="]]
+)
+def test_an_empty_word_is_no_folder_and_no_name(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_command([*words, "smoke/straight"]) == 2
+    assert "empty" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
     "line", ["-v", "version --json", "help", "help why", "list", "--json list presets"]
 )
 def test_what_asks_for_help_ends_well(line):
