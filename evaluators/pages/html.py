@@ -28,6 +28,7 @@ from alpasim_plugin.log.run_folder.records import Project, json_of
 from alpasim_plugin.log.run_folder.rows import Series, series_by_rollout
 from alpasim_plugin.log.run_folder.schema import AGAIN, WHY_NAME
 from evaluators.metrics.outcomes import OUTCOMES, has_ended, outcomes_of
+from evaluators.metrics.presets import described
 from evaluators.pages import tables
 from evaluators.pages.above import still_map
 from evaluators.pages.boundary import boundary_section
@@ -35,7 +36,7 @@ from evaluators.pages.decision import decision_section
 from evaluators.pages.fixers import pool_text, refused
 from evaluators.pages.flips import colours_of, flip_bases, flip_rows
 from evaluators.pages.gate import gate_section
-from evaluators.pages.overview import TONES, overview_of
+from evaluators.pages.overview import CUT_NOTE, DISTANCE_NOTE, TONES, overview_of
 from evaluators.pages.rollouts import OTHERS, SERIES, rollout_block
 from evaluators.pages.worst import worst_change
 from evaluators.statistics.numbers import DASH, fixed, listed_counts, percents, plural, short
@@ -159,6 +160,9 @@ def context(run: Run) -> dict[str, Any]:
         "when": (run.info.started_at or "")[:16].replace("T", " "),
         "overview": overview_of(run),
         "ending_tones": TONES,
+        "distance_note": DISTANCE_NOTE,
+        "cut_note": CUT_NOTE,
+        "preset_words": described().get(run.summary.preset, ""),
         "shots": worst_change(run),
         "decision": decision_section(run),
         "boundary": boundary_section(run.summary.boundary),

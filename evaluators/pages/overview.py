@@ -41,7 +41,18 @@ TONES: Mapping[str, Tone] = {  # of endings; the others need attention
     NOT_RUN: "unclear",
 }
 UNHARMED = (REACHED_END, NO_OUTCOME, SHORT_OF_END)
+FAILED = "failed"
+# What the line of counts says of one rollout and of several; every other ending is a failure.
+COUNTED = {
+    REACHED_END: ("reaches the end", "reach the end"),
+    FAILED: ("fails", "fail"),
+    SHORT_OF_END: ("stops short of it without a failure", "stop short of it without a failure"),
+    NO_OUTCOME: ("without an event", "without an event"),
+    NOT_RUN: ("could not be run", "could not be run"),
+}
 COLUMNS = (REACHED_END, "collision", "off-road", "stalled", OUTCOMES["policy"].words)
+DISTANCE_NOTE = "to the side of the recorded path, mean of a rollout, median of the rollouts"
+CUT_NOTE = "only up to an event that ended the scored part"
 NUMBERS = ("primary rate", "median dist. m", "ms a frame")
 VERDICTS: Mapping[Tone, str] = {
     "worse": "drives worse than",
@@ -86,6 +97,7 @@ class VariantRow:
     Attributes:
         key: In ``summary.json``.
         name: What people call it.
+        renderer, policy: Whose rollouts these are.
         endings: How many of its rollouts ended in which way, the best first.
         primary: Its primary rate, as a count where it is one.
         difference: None for a baseline, and where no rollouts can be paired.
@@ -97,6 +109,8 @@ class VariantRow:
 
     key: str
     name: str
+    renderer: str
+    policy: str
     endings: Mapping[str, int]
     primary: str
     difference: PrimaryDifference | None
@@ -155,7 +169,7 @@ class Overview:
 
     @property
     def badge(self) -> tuple[str, Tone]:
-        """Give how many variants fail and how many rollouts end early, and its colour."""
+        """Give how many variants fail, and its colour; `counts` says how all rollouts ended."""
         if not self.rows:
             return "no rollouts", "unclear"
         n_short = sum(row.endings.get(SHORT_OF_END, 0) for row in self.rows)
@@ -167,9 +181,18 @@ class Overview:
             total = plural(n_rollouts, "rollout")
         tone: Tone = "worse" if n else "unclear" if n_short else "better"
         text = f"{n} of {total} fail{'s' if n == 1 else ''}" if n else f"no failure in {total}"
-        if n_short:
-            text += f"; end not reached in {n_short} of {plural(n_rollouts, 'rollout')}"
         return text, tone
+
+    @property
+    def counts(self) -> str:
+        """Say how all rollouts ended, each counted once."""
+        n_rollouts = sum(row.n_rollouts for row in self.rows)
+        numbers = dict.fromkeys(COUNTED, 0)
+        for row in self.rows:
+            for name, n in row.endings.items():
+                numbers[name if name in COUNTED else FAILED] += n
+        parts = [f"{n} {COUNTED[key][n != 1]}" for key, n in numbers.items() if n]
+        return f"{plural(n_rollouts, 'rollout')}: {', '.join(parts)}" if parts else ""
 
     @property
     def title(self) -> str:
@@ -211,12 +234,12 @@ class Overview:
     @property
     def notes(self) -> list[str]:
         """Explain the columns as far as their heads do not."""
-        notes = [f"primary rate: {self.question}"]
+        notes = [f"primary rate: {self.question}", f"median dist.: {DISTANCE_NOTE}"]
         _, others = self.endings[-1]
         if len(others) > 1:
             notes.append(f"other: {', '.join(others)}")
         if any(row.is_cut_short for row in self.rows):
-            notes.append("*: cut short by an event")
+            notes.append(f"*: {CUT_NOTE}")
         return notes
 
     @property
@@ -461,9 +484,12 @@ def _row(
         is_cut_short = ledger.steps_after_event > 0 or ledger.steps_after_drift > 0
     mean_ms = summary.speed[key].ms_per_frame_mean if key in summary.speed else None
     median_m = entry.lateral_distance_m_median
+    first = next((rollout for rollout in run.rollouts if rollout.variant == variant), None)
     return VariantRow(
         key,
         variant_name(run, variant),
+        "" if first is None else first.renderer,
+        "" if first is None else first.policy,
         entry.endings,
         _rate_text(run, summary.metrics.get(key, {}).get(run.table.primary)),
         differences.get(key),

@@ -115,6 +115,7 @@ def overview_lines(overview: Overview, width: int) -> list[Text]:
     width = max(width, LEAST_PLOT)  # a terminal may say that it has no columns
     badge, tone = overview.badge
     lines = [Text(badge, f"{STYLES[tone]} bold")]
+    lines += [Text(line) for line in _wrapped(overview.counts, width)]
     lines += [*(Text(line, "dim") for line in _wrapped(overview.context, width)), Text()]
     lines += _grid(overview, width)
     lines += [Text(line, "dim") for line in _wrapped("; ".join(overview.notes), width)]

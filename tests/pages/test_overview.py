@@ -220,7 +220,21 @@ def test_the_headline_counts_rollouts_that_do_not_reach_the_end(three, failed, t
     summary = dataclasses.replace(run.summary, outcomes={"clean/a": short, "clean/b": other})
     shown = overview_of(dataclasses.replace(run, summary=summary))
     assert shown.badge[1] == tone
-    assert f" 4 of {4 + len(failed)}\u00a0rollouts" in shown.badge[0]
+    words = ["1 fails"] if failed else []
+    words.append("4 stop short of it without a failure")
+    assert shown.counts == f"{4 + len(failed)}\u00a0rollouts: {', '.join(words)}"
+
+
+def test_the_line_of_counts_adds_up_to_the_rollouts(usual_run, three):
+    for folder in (usual_run, three):
+        shown = overview_of(read_run(folder))
+        total, parts = shown.counts.split(": ")
+        assert int(total.split()[0]) == sum(int(part.split()[0]) for part in parts.split(", "))
+        assert int(total.split()[0]) == sum(row.n_rollouts for row in shown.rows)
+        lines = [line.plain for line in overview_lines(shown, 100)]
+        assert shown.counts.replace("\u00a0", " ") in " ".join(lines).replace("\u00a0", " ")
+        page = write_report(folder).read_text()
+        assert page.count('data-ended="') == sum(len(row.endings) for row in shown.rows)
 
 
 def test_an_evaluator_declares_no_second_primary_question():

@@ -105,6 +105,25 @@ def test_each_choice_of_the_filter_keeps_as_many_as_it_says(browser, usual_run):
     assert browser.complaints == []
 
 
+def test_a_segment_of_the_first_screen_shows_its_rollouts(browser, usual_run):
+    opened(browser, write_report(usual_run))
+    n_links = browser.evaluate("document.querySelectorAll('.ended a').length")
+    total = 0
+    for number in range(n_links):
+        link = f"document.querySelectorAll('.ended a')[{number}]"
+        n = int(str(browser.evaluate(f"{link}.title")).split()[0])
+        browser.evaluate(f"{link}.click()")
+        assert count(browser) == f"{n} of 72 rollouts"
+        assert set(column(browser, "renderer")) == {browser.evaluate(f"{link}.dataset.renderer")}
+        assert set(column(browser, "policy")) == {browser.evaluate(f"{link}.dataset.policy")}
+        total += n
+    assert total == 72
+    browser.evaluate("document.getElementById('rollouts-only').click()")
+    choose(browser, "rollouts-state", "", "change")
+    assert count(browser) == "72 rollouts"
+    assert browser.complaints == []
+
+
 def test_names_that_are_markup_stay_text(browser, hostile_run):
     opened(browser, write_report(hostile_run))
     browser.evaluate(f"{ROWS}[0].click()")

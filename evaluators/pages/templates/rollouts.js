@@ -60,7 +60,7 @@
       { name: "seed", names: true }, { name: "outcome" }, ...own, ...numbers.filter((one) => one.name === more.value),
     ];
 
-    let order = Uint32Array.from({ length: rows }, (_, row) => row), sorted = { name: "", up: true }, opened = -1, shown = drawn();
+    let order = Uint32Array.from({ length: rows }, (_, row) => row), sorted = { name: "", up: true }, opened = -1, shown = drawn(), only = null;
     const ranks = (name) => { // texts by the alphabet with numbers in it
       const { compare } = new Intl.Collator("en", { numeric: true });
       return new Map([...new Set(texts[name])].sort(compare).map((value, place) => [value, place]));
@@ -73,13 +73,13 @@
     };
 
     const select = () => {
-      const keep = keeps.get(choice.value);
+      const keep = keeps.get(choice.value), isOnly = (row) => !only || (text("renderer", row) === only.renderer && text("policy", row) === only.policy);
       const words = at("rollouts-words").value.toLowerCase().split(/\s+/).filter(Boolean);
       const has = (row, word) => text("seed", row) === word || ["scene", "renderer", "policy"].some((name) => text(name, row).toLowerCase().includes(word));
       const kept = new Uint32Array(rows);
       let n = 0;
       for (let row = 0; row < rows; row++) {
-        if (keep(row) && words.every((word) => has(row, word))) kept[n++] = row;
+        if (keep(row) && isOnly(row) && words.every((word) => has(row, word))) kept[n++] = row;
       }
       order = kept.slice(0, n);
       const chosen = shown.find((one) => one.name === sorted.name);
@@ -161,6 +161,23 @@
       picked.hidden = false;
       draw();
     };
+
+    // A segment of the first screen shows its rollouts: one variant's, with one ending.
+    const onlyButton = at("rollouts-only");
+    const restrict = (variant) => {
+      only = variant;
+      onlyButton.hidden = !only;
+      if (only) onlyButton.textContent = `${only.renderer}, ${only.policy} \u00d7`;
+    };
+    onlyButton.addEventListener("click", () => { restrict(null); select(); });
+    document.addEventListener("click", (event) => {
+      const link = event.target.closest("a[data-ended]");
+      if (!link) return;
+      restrict({ renderer: link.dataset.renderer, policy: link.dataset.policy });
+      at("rollouts-words").value = "";
+      choice.value = "ended " + link.dataset.ended;
+      select();
+    });
 
     let waiting = false;
     box.addEventListener("scroll", () => {
