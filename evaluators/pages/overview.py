@@ -46,7 +46,10 @@ FAILED = "failed"
 COUNTED = {
     REACHED_END: ("reaches the end", "reach the end"),
     FAILED: ("fails", "fail"),
-    SHORT_OF_END: ("stops short of it without a failure", "stop short of it without a failure"),
+    SHORT_OF_END: (
+        "stops short of the end without a failure",
+        "stop short of the end without a failure",
+    ),
     NO_OUTCOME: ("without an event", "without an event"),
     NOT_RUN: ("could not be run", "could not be run"),
 }

@@ -221,7 +221,7 @@ def test_the_headline_counts_rollouts_that_do_not_reach_the_end(three, failed, t
     shown = overview_of(dataclasses.replace(run, summary=summary))
     assert shown.badge[1] == tone
     words = ["1 fails"] if failed else []
-    words.append("4 stop short of it without a failure")
+    words.append("4 stop short of the end without a failure")
     assert shown.counts == f"{4 + len(failed)}\u00a0rollouts: {', '.join(words)}"
 
 
