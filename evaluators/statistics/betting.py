@@ -177,7 +177,7 @@ def growing(wanted: F64, tail: F64) -> F64:
         tail: ``(...)`` E x^4 / E x^2, above 0.
 
     Example:
-        >>> float(growing(np.array(10.0), np.array(1.0)))
+        >>> round(float(growing(np.array(10.0), np.array(1.0))), 9)
         2.0
     """
     half = 0.5 * wanted / tail

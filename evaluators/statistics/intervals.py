@@ -186,7 +186,7 @@ def paired_rate(gained: float, lost: float, n: int) -> tuple[float, float]:
 
     Example:
         >>> [round(b, 3) for b in paired_rate(1, 0, 3)]
-        [-0.33, 0.792]
+        [-0.415, 0.792]
     """
 
     def score(difference: float) -> float:
