@@ -225,6 +225,17 @@ def test_a_lane_is_driven_as_roadrunner_says(more, direction, is_turned):
     assert ("1 lanes are driven as travelDir" in str(notes)) == is_turned
 
 
+def test_edges_of_a_tight_bend_follow_their_circles():
+    """A corner on half a metre: chords of 0.5 m of the reference line would cut it by 0.8 m."""
+    arc = '<geometry s="0" x="0" y="0" hdg="0" length="1"><arc curvature="2"/></geometry>'
+    lanes, _ = read(road("1", section(0, lane(-1), lane(-2)), length=1.0, view=arc))
+    for key, radius_m in (("1.0.-1", 4.0), ("1.0.-2", 7.5)):
+        edge = lanes.lanes[key].right[:, :2]
+        middles = (edge[1:] + edge[:-1]) / 2
+        away = np.hypot(*(middles - [0.0, 0.5]).T)
+        assert away == pytest.approx(radius_m, abs=0.05)
+
+
 def test_a_limit_of_zero_is_none():
     made = lane(-1).replace("</lane>", '<speed sOffset="0" max="0.0e+00" unit="mph"/></lane>')
     text = road("1", section(0, made))

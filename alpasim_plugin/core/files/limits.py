@@ -138,7 +138,7 @@ MAP_ROAD_M = Bound(
 )
 CURVATURE_PER_M = Bound("curvature", "1/m", -0.2, 0.2, "a car cannot turn on a radius below 5 m")
 MAP_CURVATURE_PER_M = Bound(
-    "curvature in a map", "1/m", -2, 2, "corners of junctions turn on half a metre"
+    "curvature in a map", "1/m", -20, 20, "corners of junctions turn on five centimetres"
 )
 LATERAL_OFFSET_M = Bound(
     "distance beside a reference line", "m", -1000, 1000, "no lane lies farther beside its road"
