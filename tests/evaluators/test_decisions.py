@@ -166,13 +166,13 @@ def test_the_bound_of_what_lies_beyond_a_cap_holds_wherever_one_stops():
     """Three scenes in a hundred lie beyond; the bound is below that at some scene in few runs."""
     question = asked(("lateral_distance_m", 0.1))
     wrong = 0
-    for number in range(40):
+    for number in range(20):
         x = np.where(rng(2000 + number).random(150) < 0.03, 20.0, 0.0)
         beyond = state_after(question, {"lateral_distance_m": x}, 150).metrics[
             "lateral_distance_m"
         ]["beyond"]
         wrong += beyond["at_most"] < 0.03
-    assert wrong <= 4
+    assert wrong <= 3
 
 
 def test_metres_get_no_bad_answer_where_few_scenes_that_are_far_better_bring_the_mean_to_the_margin():
