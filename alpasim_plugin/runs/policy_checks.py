@@ -94,19 +94,7 @@ def check_policies(
             todo.append(policy)
         if policy.address is not None:
             _check_address(policy, scenarios)
-    workers = min(how.threads.workers, len(todo))
-    limit_s = how.limit_s or LIMIT_S
-    check_one = partial(_check, scenarios)
-    threads = how.threads.per_worker
-    checked = run_jobs(
-        check_one, todo, workers, threads, limit_s, parts_of=lambda policy: policy.name
-    )
-    for policy, result in checked:
-        if isinstance(result, Lost):
-            result = _of_lost(result, limit_s)
-        if isinstance(result, InputError):
-            raise result
-        checks[policy.name] = replace(result, digest=policy.digest)
+    checks |= _checked(todo, scenarios, how)
     unmade = [
         text for check in checks.values() for name, text in check.breaches if name in NEVER_DRIVES
     ]
@@ -115,6 +103,33 @@ def check_policies(
     for policy in todo:
         for _, sentence in checks[policy.name].breaches:
             noticed(f"check of {policy.name}: {sentence}")
+    return checks
+
+
+def _checked(
+    policies: Sequence[PartSpec], scenarios: Sequence[Scenario], how: HowToRun
+) -> dict[str, PolicyCheck]:
+    """Check policies in worker processes, and return what was found by name.
+
+    Raises:
+        InputError: A scenario lacks a camera of a policy.
+    """
+    limit_s = how.limit_s or LIMIT_S
+    results = run_jobs(
+        partial(_check, scenarios),
+        policies,
+        min(how.threads.workers, len(policies)),
+        how.threads.per_worker,
+        limit_s,
+        parts_of=lambda policy: policy.name,
+    )
+    checks = {}
+    for policy, result in results:
+        if isinstance(result, Lost):
+            result = _of_lost(result, limit_s)
+        if isinstance(result, InputError):
+            raise result
+        checks[policy.name] = replace(result, digest=policy.digest)
     return checks
 
 
