@@ -11,7 +11,6 @@ import sys
 
 import pytest
 import torch
-import torch.distributed.checkpoint as distributed
 from safetensors.torch import save_file
 
 from alpasim_plugin.block_fixers.dit import FLOAT32_KEYS, CosmosCausalDiT
@@ -113,6 +112,7 @@ def of_the_page(repo, word, folder):
     return [sys.executable, *shlex.split(line.replace("FOLDER", str(folder)), comments=True)[1:]]
 
 
+@pytest.mark.slow
 def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
     sd = random_weights(SMALL)
     folder = tmp_path / "shards"
@@ -136,7 +136,9 @@ def test_shards_of_safetensors_are_joined_by_the_page(repo, tmp_path):
 def test_shards_of_torch_are_joined_by_the_page(repo, tmp_path):
     sd = random_weights(SMALL)
     folder = tmp_path / "shards"
-    distributed.save({f"net.{key}": value for key, value in sd.items()}, checkpoint_id=folder)
+    from torch.distributed import checkpoint  # its import takes seconds
+
+    checkpoint.save({f"net.{key}": value for key, value in sd.items()}, checkpoint_id=folder)
     with pytest.raises(InputError):
         load_weights(folder)
     subprocess.run(of_the_page(repo, "dcp_to_torch", folder), cwd=tmp_path, check=True)

@@ -76,6 +76,7 @@ def test_a_verb_waits_once_a_frame(verb, waits, launches, megabytes, tmp_path, m
     assert traffic.bytes_down <= megabytes * 1e6
 
 
+@pytest.mark.slow
 def test_a_served_frame_waits_once(monkeypatch):
     made = assemble(Settings(renderer="onefixer+clean", scenes=[SCENE], device="cuda"))
     context = SimpleNamespace(time_remaining=lambda: 60.0, is_active=lambda: True)
