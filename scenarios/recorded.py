@@ -14,10 +14,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import feather
 
 from alpasim_plugin.core import files as reading
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.arrow import read_arrow
 from alpasim_plugin.core.files.fields import met_in
 from alpasim_plugin.core.files.limits import COORDINATE_M, SOURCE_BYTES
 from alpasim_plugin.core.files.reading import parse_xml
@@ -141,8 +141,7 @@ class SourceFiles:
         data = self.read_bytes(path)
         do = "fetch the file again; it may be truncated"
         with reading.parsing(path, do, "no readable Arrow IPC file"):
-            table = feather.read_table(pa.BufferReader(data))
-            table.validate(full=True)
+            table = read_arrow(pa.py_buffer(data), path)
         check_columns(table, columns, path, "use a file of the Argoverse 2 sensor set")
         if holder:
             self.met += met_in(holder, table.column_names)

@@ -20,6 +20,7 @@ import pyarrow as pa
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import check_regular, parsing
+from alpasim_plugin.core.files.arrow import read_arrow
 from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, BODY_M
 from alpasim_plugin.core.geometry import interpolate, intrinsics, inverse, se3
@@ -174,8 +175,7 @@ def _modality(
     path = folder / f"{key}.arrow"
     check_regular(path, ARCHIVE_BYTES, DO_THIS)
     with parsing(path, DO_THIS, "no Arrow file of py123d"):
-        table = pa.ipc.open_file(pa.memory_map(str(path))).read_all()
-        table.validate(full=True)
+        table = read_arrow(pa.memory_map(str(path)).read_buffer(), path)
         facts = msgpack.unpackb((table.schema.metadata or {})[b"metadata"], strict_map_key=False)
         return facts, [table.column(f"{key}.{name}") for name in columns]
 
