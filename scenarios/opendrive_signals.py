@@ -186,10 +186,10 @@ def _senses(road: Road, signal: RoadSignal) -> tuple[bool, ...]:
     lanes that it names are none: RoadRunner's posts stand for references on other roads.
 
     The lanes decide where all of them are driven against the orientation, as CARLA reads RoadRunner's
-    references.
+    references. Lights for people name lane 0: they stand for none.
     """
     facing = {"+": (True,), "-": (False,)}.get(signal.orientation, (True, False))
-    if not signal.lanes:
+    if not signal.lanes or signal.kind == PEDESTRIAN_LIGHT:
         return facing
     driven = {
         driven_along(road, lane)

@@ -180,6 +180,20 @@ def test_linked_lanes_that_do_not_meet_are_named():
     assert link_notes(pair(50.05)) == ()
 
 
+def test_a_light_for_people_names_lane_0_and_stands_for_those_who_cross():
+    text = road("1", section(0, lane(1), lane(-1)))
+    walk = (POST % "-").replace("1000001", "1000002")
+    odr = parse_map(
+        "map.xodr",
+        ElementTree.fromstring(
+            f"<OpenDRIVE>{text.replace('</road>', walk + '</road>')}</OpenDRIVE>"
+        ),
+    )
+    lanes, _ = read_lanes("map.xodr", odr, np.eye(4))
+    (head,), notes = traffic_lights(odr, lanes, np.eye(4))
+    assert (head.signal.pedestrians, notes) == (True, ())
+
+
 def test_links_between_lanes_that_end_at_each_other_are_said_and_not_followed():
     """As shoulders around a corner: the number on the one side, its negative on the other."""
     first = road("1", section(0, lane(1), lane(-1, None, 1)), after="road:2:start")
