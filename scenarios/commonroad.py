@@ -201,7 +201,8 @@ def _larger(obstacle: Element) -> float:
         return 0.0
     area = _area(parts)
     (length, width), _, _ = _box_around(area)
-    return float(length * width / shapely.union_all(area.geoms).area) - 1.0
+    covered = shapely.union_all(shapely.make_valid(list(area.geoms)))
+    return float(length * width / covered.area) - 1.0
 
 
 def _rectangle(part: Element) -> tuple[tuple[float, float], tuple[float, float], float]:

@@ -122,7 +122,7 @@ def _heads(
     T_local_map: F64,
 ) -> list[Head]:
     heads = []
-    for along in _senses(road, light):
+    for along in _held_senses(road, light, lanes):
         link = road.successor if along else road.predecessor
         junction = f"on road {road.road_id}"
         stop_lines = [
@@ -198,6 +198,20 @@ def _senses(road: Road, signal: RoadSignal) -> tuple[bool, ...]:
         if lane.lane_id != 0 and signal.holds(lane.lane_id)
     }
     return tuple(sense for sense in facing if sense in driven) or tuple(driven)
+
+
+def _held_senses(road: Road, light: RoadSignal, lanes: Mapping[str, Lane]) -> tuple[bool, ...]:
+    """Return `_senses` of a light; of one that names no lanes and stands on a road of a junction the
+    other one where that alone has lanes: RoadRunner writes the sign of the lanes, and such roads are
+    one-way.
+    """
+    senses = _senses(road, light)
+    if light.lanes or light.kind == PEDESTRIAN_LIGHT or road.junction == "-1":
+        return senses
+    starts_m = {True: 0.0, False: road.length_m}
+    if any(_lanes_at(road, starts_m[along], along, light, lanes) for along in senses):
+        return senses
+    return tuple(not along for along in senses)
 
 
 Held = tuple[str, float, float]  # a lane and the signed distances of its borders

@@ -180,6 +180,18 @@ def test_linked_lanes_that_do_not_meet_are_named():
     assert link_notes(pair(50.05)) == ()
 
 
+@pytest.mark.parametrize(("junction", "held"), [("9", ["1.0.-1"]), ("-1", [])])
+def test_a_light_on_a_one_way_road_of_a_junction_is_for_its_lane(junction, held):
+    text = road("1", section(0, lane(-1)), junction=junction)
+    light = (POST % "-").replace('<validity fromLane="0" toLane="0"/>', "")
+    text = text.replace("</road>", f"{light}</road>")
+    odr = parse_map("map.xodr", ElementTree.fromstring(f"<OpenDRIVE>{text}</OpenDRIVE>"))
+    lanes, _ = read_lanes("map.xodr", odr, np.eye(4))
+    heads, notes = traffic_lights(odr, lanes, np.eye(4))
+    assert [list(head.signal.lanes) for head in heads] == ([held] if held else [])
+    assert bool(notes) != bool(held)
+
+
 def test_a_light_for_people_names_lane_0_and_stands_for_those_who_cross():
     text = road("1", section(0, lane(1), lane(-1)))
     walk = (POST % "-").replace("1000001", "1000002")
