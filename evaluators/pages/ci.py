@@ -1,6 +1,7 @@
 """Files for a CI service: summary.md and junit.xml of a run, and the same of a gate."""
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -186,6 +187,7 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
         accepts_failures: A rollout that did not run to its end is skipped and no error.
     """
     named = run.info.asked or ()
+    counts = Counter(rollout.cell for rollout in run.rollouts)
     facts = {
         "preset": run.summary.preset,
         "version": run.info.version,
@@ -197,7 +199,13 @@ def rollout_suite(run: Run, outcomes_fail: bool = True, accepts_failures: bool =
         # what the command named, if that was one thing
         named[0] if len(named) == 1 else name_of(run),
         [
-            _rollout_case(rollout, with_values, outcomes_fail, accepts_failures)
+            _rollout_case(
+                rollout,
+                case_name(rollout, counts[rollout.cell] > 1),
+                with_values,
+                outcomes_fail,
+                accepts_failures,
+            )
             for rollout in run.rollouts
         ]
         + check_cases(run),
@@ -222,10 +230,17 @@ def name_of(run: Run) -> str:
     return ", ".join(real(folder).name for folder in run.folders or (run.folder,))
 
 
-def _rollout_case(
-    rollout: Rollout, with_values: bool, outcomes_fail: bool, accepts_failures: bool
-) -> Case:
+def case_name(rollout: Rollout, is_repeated: bool) -> str:
+    """Return the name of a rollout's case within its scene; of several logs of one cell with the
+    log's name, since CI services take cases of one name for one.
+    """
     name = f"{rollout.renderer}/{rollout.policy}/{rollout.seed}"
+    return f"{name} {rollout.log}" if is_repeated and rollout.log else name
+
+
+def _rollout_case(
+    rollout: Rollout, name: str, with_values: bool, outcomes_fail: bool, accepts_failures: bool
+) -> Case:
     time_s = rollout.wall_s or 0.0
     facts: dict[str, object] = {"path": rollout.path} if rollout.path else {}
     if not rollout.ok:

@@ -196,10 +196,7 @@ def context(run: Run) -> dict[str, Any]:
         ),
         "every_rollout": rollout_block(run),
         "failed": [rollout for rollout in run.rollouts if not rollout.ok],
-        "hints": {
-            (cell.renderer, cell.policy, cell.scene, cell.seed): cell.error.hint
-            for cell in run.summary.failures.cells
-        },
+        "hints": {cell.path: cell.error.hint for cell in run.summary.failures.cells},
         "command": command_of(run),
         "commit": _commit(run.info.project),
         "options": json_of(run.info.config),

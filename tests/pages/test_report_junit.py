@@ -1,4 +1,5 @@
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 from evaluators.pages.ci import rollout_suite, write_junit
 from evaluators.statistics.opening import read_run
@@ -50,3 +51,13 @@ def test_hostile_names_and_control_characters_give_readable_xml(hostile_run):
     error = next(root.iter("error"))
     assert error.attrib["message"] == "</script><script>alert(1)</script>"
     assert "\\x00\\x1b[31m" in (error.text or "")
+
+
+def test_two_logs_of_one_cell_are_two_cases(usual_run):
+    run = read_run(usual_run)
+    first = run.rollouts[0]
+    twice = [replace(first, log=name) for name in ("log 1", "log 2")]
+    names = [case.name for case in rollout_suite(replace(run, rollouts=twice)).cases]
+    assert names == [f"{first.renderer}/{first.policy}/{first.seed} {one.log}" for one in twice]
+    (case,) = rollout_suite(replace(run, rollouts=twice[:1])).cases
+    assert case.name == f"{first.renderer}/{first.policy}/{first.seed}"
