@@ -175,10 +175,13 @@ def test_a_scenario_that_has_changed_is_refused(root, tmp_path):
 
 
 def test_two_policies_share_a_camera_at_the_shorter_period(straight_road):
-    first = (SensorSpec("front"), SensorSpec("left", 200_000))
-    then = (SensorSpec("front", 50_000), SensorSpec("left"), SensorSpec("rear"))
+    first = (SensorSpec("front", 200_000), SensorSpec("left", 200_000))
+    then = (SensorSpec("front", 100_000), SensorSpec("left"), SensorSpec("rear"))
     assert merge_sensors(first, then, straight_road) == (
-        SensorSpec("front", 50_000),
+        SensorSpec("front", 100_000),
         SensorSpec("left"),
         SensorSpec("rear"),
     )
+    between_plans = (SensorSpec("front", 50_000),)
+    with pytest.raises(InputError, match="sees it every 200000 us, the new one every 50000 us"):
+        merge_sensors(first, between_plans, straight_road)
