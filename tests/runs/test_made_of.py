@@ -2,6 +2,7 @@
 why.
 """
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -74,6 +75,14 @@ def write_rig(folder, **keys):
 def write_model(path, seed, half_m=0.7):
     points = np.random.default_rng(seed).uniform(-half_m, half_m, (50, 3))
     write_ply(path, cloud_from_points(points, np.full((50, 3), 0.5)))
+
+
+def module_of(folder, name):
+    """Return the name of a module in a test's folder: a process imports each name from one place, so
+    that tests of one process, in any order, share none.
+    """
+    place = hashlib.sha256(str(folder).encode()).hexdigest()[:8]
+    return f"{name}_{place}"
 
 
 @pytest.fixture
@@ -245,29 +254,31 @@ def test_the_planes_of_a_model_in_a_folder_are_read_through_the_record(tmp_path)
 
 
 POLICY = """
-import %s_gains
+import {gains}
 from policies.simple import ConstantVelocity
 
 class Mine(ConstantVelocity):
-    gain = %s_gains.GAIN
+    gain = {gains}.GAIN
 """
 
 
 @pytest.mark.parametrize("place", ["beside", "elsewhere"])
 def test_a_policy_is_all_code_that_it_imports(tmp_path, monkeypatch, place):
     """An editable package and ``PYTHONPATH`` both put a folder on Python's path."""
-    (tmp_path / "mine.py").write_text(POLICY % (place, place))
+    gains = module_of(tmp_path, "gains")
+    constant = module_of(tmp_path, "constant")
+    (tmp_path / "mine.py").write_text(POLICY.replace("{gains}", gains))
     folder = tmp_path if place == "beside" else tmp_path / "elsewhere"
     folder.mkdir(exist_ok=True)
     if folder != tmp_path:
         monkeypatch.syspath_prepend(folder)
-    (folder / f"{place}_gains.py").write_text(f"from {place}_inner import GAIN\n")
-    inner = folder / f"{place}_inner.py"
+    (folder / f"{gains}.py").write_text(f"from {constant} import GAIN\n")
+    inner = folder / f"{constant}.py"
     inner.write_text("GAIN = 1.0\n")
     name = f"{tmp_path / 'mine.py'}:Mine"
     before = resolve("policy", name)
     names = {path.rpartition("/")[2] for path in before.code}
-    assert names == {"mine.py", f"{place}_gains.py", f"{place}_inner.py"}
+    assert names == {"mine.py", f"{gains}.py", f"{constant}.py"}
     inner.write_text("GAIN = 2.0\n")
     assert part_digest([tmp_path / "mine.py"], "Mine", None, {}) != before.digest
 
@@ -397,8 +408,8 @@ SCALE = 2.0
 
 
 def scale_of(folder):
-    """Return the module that an evaluator imports: a process imports each name from one place."""
-    return folder / f"scale_of_{folder.name}.py"
+    """Return the module that an evaluator imports."""
+    return folder / f"{module_of(folder, 'scale')}.py"
 
 
 @pytest.fixture

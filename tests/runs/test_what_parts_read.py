@@ -2,6 +2,7 @@
 whoever read it first in a process.
 """
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,7 @@ def policies(tmp_path, monkeypatch):
     it is first called; a process imports a name from one place.
     """
     monkeypatch.chdir(tmp_path)
-    helper = f"helper_of_{tmp_path.name}"
+    helper = f"helper_of_{hashlib.sha256(str(tmp_path).encode()).hexdigest()[:8]}"
     (tmp_path / "unit.json").write_text("1")
     (tmp_path / "table.json").write_text('{"gain": 1}')
     (tmp_path / f"{helper}.py").write_text(HELPER.replace("{folder}", str(tmp_path)))
