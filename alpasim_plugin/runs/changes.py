@@ -52,8 +52,15 @@ def reasons(cell: Cell, manifest: Manifest, held: RunInfo | None, plan: RunPlan)
             changed.append(f"{name} is new")
         elif before[name] != now[name]:
             files = _files_of(name, held, plan, manifest.rewritten)
-            changed += files or [f"{name} is another one"]
+            changed += files or [_other(name, cell)]
     return changed
+
+
+def _other(name: str, cell: Cell) -> str:
+    """Say that what a rollout was made of under a name is another one, where no file is known to be."""
+    if name == f"scene {cell.scene}":
+        return f"{name} is another one: its file {cell.ref.path}, or what is set in it, was changed"
+    return f"{name} is another one"
 
 
 def score_reasons(manifest: Manifest, held: RunInfo | None, plan: RunPlan) -> list[str]:

@@ -286,9 +286,10 @@ def test_a_policy_is_all_code_that_it_imports(tmp_path, monkeypatch, place):
 WORDS = ("--workers", "1", "--images", "none", "--no-report")
 
 
-def driven(folder, capfd, renderer="clean", policy="constant-velocity"):
+def driven(folder, capfd, renderer="clean", policy="constant-velocity", length_m=200):
     """Drive the scene of a folder; return when each log was written, and what was said."""
-    (folder / "scene.yaml").write_text(SCENE.replace(HILLS, ""))
+    text = SCENE.replace(HILLS, "").replace("200", str(length_m))
+    (folder / "scene.yaml").write_text(text)
     words = ["--renderer", renderer, "--policy", policy]
     command = [*words, *WORDS, "--out", str(folder / "run")]
     assert run_command([*command, str(folder / "scene.yaml")]) == 0
@@ -305,6 +306,7 @@ def test_an_edited_calibration_is_driven_again_with_its_name_and_nothing_else_is
     other, said = driven(scene, capfd)
     assert other != first
     assert f"1 rollout is driven again: {scene / 'rig.json'} was edited" in said
+    assert f"its file {scene / 'scene.yaml'}" in driven(scene, capfd, length_m=210)[1]
 
 
 RENDERER = """
