@@ -236,12 +236,16 @@ class Osm:
 
 def _in_tangent_plane(table: F64) -> tuple[F64, float, float]:
     """Project longitude and latitude ``(N, 3)`` (degrees; heights, metres, stay) onto the plane that
-    touches the earth in their middle: east, north, and latitude and longitude of that middle.
+    touches the earth in their middle: east, north, and latitude and longitude of that middle. A map
+    may lie on both sides of the 180th meridian.
     """
-    lon_lat = table[:, :2]
+    lon_lat = table[:, :2].copy()
     lon, lat = 0.0, 0.0
     if len(table):
+        if np.ptp(lon_lat[:, 0]) > 180.0:
+            lon_lat[:, 0] %= 360.0
         lon, lat = np.round((lon_lat.min(axis=0) + lon_lat.max(axis=0)) / 2, 3)
+        lon = lon - 360.0 if lon > 180.0 else lon
     earth = earth_xyz(table[:, 1], table[:, 0], np.zeros(len(table)))
     points = transform_points(T_enu_earth(lat, lon, 0.0), earth)
     points[:, 2] = table[:, 2]

@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperArgument
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.escape import shorten
 from alpasim_plugin.core.files.limits import SEED, SEEDS
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts.grammar import split_label
@@ -214,6 +215,9 @@ def fixer_overrides(texts: Sequence[str]) -> list[str]:
     return [text.removeprefix(FIXER_PREFIX) for text in texts]
 
 
+SHOWN = 80  # characters of a value in a message
+
+
 def parse_seeds(text: str) -> list[int]:
     """Parse ``--seeds``.
 
@@ -225,7 +229,7 @@ def parse_seeds(text: str) -> list[int]:
         InputError: Not a positive count nor a list of non-negative integers of 63 bits.
     """
     parts = [part.strip() for part in text.split(",") if part.strip()]
-    is_whole = all(re.fullmatch("[0-9]+", part) for part in parts)
+    is_whole = all(re.fullmatch("[0-9]{1,19}", part) for part in parts)  # 63 bits have 19 digits
     values = [int(part) for part in parts] if is_whole else []
     if "," not in text and len(values) == 1 and values[0] > 0:
         SEEDS.check(values[0], f"--seeds {text}")
@@ -234,7 +238,7 @@ def parse_seeds(text: str) -> list[int]:
         SEEDS.check(len(values), "--seeds")
         return values
     raise InputError(
-        f"--seeds {text}: neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1",
+        f"--seeds {shorten(text, SHOWN)}: neither a count from 1 up nor a list of seeds from 0 to 2^63 - 1",
         "write a count such as 3, or a list such as 4,7",
     )
 

@@ -169,7 +169,7 @@ class Execution:
     ] = True
     time_limit: Annotated[
         float | None,
-        Flag("Seconds after which a rollout is ended and reported.", min=0.001),
+        Flag("Seconds after which a rollout is ended and reported.", min=0.001, max=2_592_000),
     ] = None
     out: Annotated[Path | None, Flag("Run folder; default: below runs/.")] = None
     resume: Annotated[

@@ -202,6 +202,15 @@ def test_malformed_messages_change_nothing(upstream, overrides, count):
         assert answers(stub, frames) == before
 
 
+def test_a_message_that_is_no_protobuf_is_one_line_of_the_log(upstream, caplog):
+    method = methods("SensorsimService")["render_rgb"]
+    with channel_to(upstream) as channel, pytest.raises(grpc.RpcError):
+        channel.unary_unary(method.path)(b"\xff\xff\xff", timeout=30)
+    (record,) = [one for one in caplog.records if one.name == "grpc._common"]
+    assert "no protobuf" in record.getMessage()
+    assert not record.exc_info
+
+
 def test_health_and_reflection_answer_under_public_names(upstream):
     service = assemble(Settings(renderer="identity", upstream=Upstream(upstream.address))).service
     with hosted({"SensorsimService": service}) as host, channel_to(host) as to:

@@ -16,6 +16,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InternalError
 from tests.examples import first_of, first_rows_of
 
+MANY_DIGITS = "9" * 5000
 PLUGIN = '''
 import errno, os, signal
 from typing import Annotated
@@ -204,6 +205,23 @@ def test_what_the_machine_refuses_is_its_failure(monkeypatch, capsys, error):
     monkeypatch.setattr(main, "_run", refused)
     assert run_command(["list", "renderers"]) == 4
     assert len(two_parts(capsys.readouterr().err)) == 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--seeds", MANY_DIGITS],
+        ["--seeds", f"1,{MANY_DIGITS}"],
+        ["--set", f"timing.duration_us={MANY_DIGITS}"],
+        ["--set", f"actors.{MANY_DIGITS}.speed_mps=1"],
+        ["--workers", MANY_DIGITS],
+        ["--time-limit", MANY_DIGITS],
+    ],
+    ids=lambda words: words[0],
+)
+def test_numbers_of_thousands_of_digits_are_bad_input(capsys, words):
+    assert run_command(["run", "--dry-run", *words, "smoke/lead_car"]) == 2
+    assert max(map(len, two_parts(capsys.readouterr().err))) < 700
 
 
 @pytest.mark.skipif(

@@ -126,9 +126,13 @@ def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_pa
     assert made.source == "lanelet2"
 
 
-def test_latitude_and_longitude_become_east_and_north(tmp_path):
+@pytest.mark.parametrize("west", [8.4, 179.996])  # the second one crosses the 180th meridian
+def test_latitude_and_longitude_become_east_and_north(tmp_path, west):
+    def lon(column):
+        return (west + 2e-3 * column + 180.0) % 360.0 - 180.0
+
     nodes = [
-        f'<node id="{10 * row + c}" lat="{49.0 + 4e-5 * row}" lon="{8.4 + 2e-3 * c}"/>'
+        f'<node id="{10 * row + c}" lat="{49.0 + 4e-5 * row}" lon="{lon(c)}"/>'
         for row in (1, 2, 3)
         for c in (1, 2, 3)
     ]

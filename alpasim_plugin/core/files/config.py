@@ -32,6 +32,7 @@ MOST_FILES = 64  # of one document, through extends
 MOST_LEVELS = 40
 MOST_PROBLEMS = 200  # of one file that are put in order
 SHOWN_PROBLEMS = 4
+SHOWN = 80  # characters of a value in a message
 TAG = "tag:yaml.org,2002:"
 
 Key = tuple[str | int, ...]
@@ -256,7 +257,10 @@ class _Builder:
                     if math.isfinite(number):
                         return number
         except ValueError as error:
-            raise self.error(node, f"{text!r} is not a number", "correct the number") from error
+            number_text = repr(shorten(text, SHOWN))
+            raise self.error(
+                node, f"{number_text} is not a number", "correct the number"
+            ) from error
         if node.tag == f"{TAG}float":
             raise self.error(node, f"the number {text}", "give a finite number")
         raise self.error(node, f"the tag {node.tag!r}", "use plain YAML values without tags")
@@ -345,7 +349,7 @@ def _assign(data: Any, keys: Sequence[str | int], value: Any, location: str) -> 
             ids = [item.get("id") if isinstance(item, dict) else None for item in node]
             if key in ids:
                 step = ids.index(key)
-            elif key.isdecimal() and int(key) < len(node):
+            elif re.fullmatch("[0-9]{1,9}", key) and int(key) < len(node):
                 step = int(key)
             else:
                 choices = ", ".join(str(name) for name in ids if name) or f"0..{len(node) - 1}"
