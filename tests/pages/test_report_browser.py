@@ -57,6 +57,15 @@ def test_changed_outcomes_lead_to_their_frames(browser, usual_run):
     assert all((usual_run / link).exists() for link in links)
 
 
+def test_on_a_phone_every_link_of_the_navigation_is_in_sight(browser, usual_run):
+    browser.open(write_report(usual_run), width=390)
+    sides = browser.evaluate(
+        "[...document.querySelectorAll('.bar nav a')].map(a => a.getBoundingClientRect()).map(r => [r.left, r.right])"
+    )
+    assert len(sides) >= 5
+    assert all(0 <= left < right <= 390 for left, right in sides)
+
+
 def test_flips_sort_by_when_the_plans_parted_with_unknown_ones_last(browser, usual_run):
     browser.open(write_report(usual_run))
     head = "[...document.querySelectorAll('#table-flips th .sort')].find(b => b.textContent.startsWith('Plans part')).click()"
