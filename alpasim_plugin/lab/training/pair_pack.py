@@ -27,17 +27,21 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.arrays import open_npy
 from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, restore_folder
+from alpasim_plugin.core.files.limits import GIB, Bound
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.pair_store import SEQUENCE_FILE, write_info
 from alpasim_plugin.lab.training.reference_store import F16
-from alpasim_plugin.log.video import VideoWriter, read_mp4
+from alpasim_plugin.log.video import VideoReader, VideoWriter
 
 IMAGES = ("rgb_input", "rgb_gt", "sdmap", "references/rgb")
 SHARES = ("opacity",)
 DEPTHS = ("depth", "references/depth")
 PACKED = "packed"
 LIMIT_BYTES = 40_000_000
+SEQUENCE_BYTES = Bound(
+    "unpacked size of a sequence", "bytes", 0, GIB, "200 frames of 1280 x 720 take 0.6 GB"
+)
 ENTRY_BYTES = 300  # of a file's entries in the archive, at most
 CRF = 33  # of the encoder
 # Depths from a quarter of a metre to a kilometre
@@ -117,6 +121,8 @@ def unpack(path: Path, folder: Path) -> Path:
             if not (folder / split / sequence / SEQUENCE_FILE).exists():
                 start = f"{split}/{sequence}/"
                 files = {one.removeprefix(start): one for one in names if one.startswith(start)}
+                size = sum(archive.getinfo(entry).file_size for entry in files.values())
+                SEQUENCE_BYTES.check(size, f"{path}, {start}")
                 contents = {one: archive.read(entry) for one, entry in files.items()}
                 _decode(contents, folder / split / sequence)
     return folder
@@ -183,11 +189,24 @@ def _encode(levels: U8) -> bytes:
 
 
 def _images(video: bytes, shape: Sequence[int]) -> U8:
-    """Return the images of a video, of the shape that was packed."""
+    """Return the images of a video, of the shape that was packed.
+
+    Raises:
+        InputError: They would take more memory than the bound.
+        ValueError: The video has others.
+    """
+    frames: list[U8] = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "images.mp4"
         path.write_bytes(video)
-        images = read_mp4(path).frames[: shape[0], : shape[1], : shape[2]]
+        with VideoReader(path) as reader:
+            size = shape[0] * reader.format.width * reader.format.height * 3
+            SEQUENCE_BYTES.check(size, f"images {tuple(shape)}")
+            for frame in reader:
+                if len(frames) == shape[0]:
+                    raise ValueError(f"more than {shape[0]} images")
+                frames.append(frame.image)
+    images = np.stack(frames)[:, : shape[1], : shape[2]]
     images = images if len(shape) == 4 else images[..., 0]
     if images.shape != tuple(shape):
         raise ValueError(f"images {images.shape} for {tuple(shape)}")

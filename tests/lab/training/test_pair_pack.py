@@ -2,6 +2,7 @@
 
 import shutil
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.lab.training import pair_pack
 from alpasim_plugin.lab.training.pair_pack import (
     depth_of_levels,
     levels_of_depth,
@@ -90,6 +92,31 @@ def test_a_pack_writes_nowhere_else(name, tmp_path):
     with pytest.raises(InputError):
         unpack(tmp_path / "bad.pack", tmp_path / "new" / "folder")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_pack_that_unpacks_to_too_much_is_refused(pack, tmp_path, monkeypatch):
+    was = pair_pack.SEQUENCE_BYTES
+    monkeypatch.setattr(pair_pack, "SEQUENCE_BYTES", replace(was, high=14 * 32 * 48 * 3 - 1))
+    with pytest.raises(InputError, match="unpacked size of a sequence"):
+        unpack(pack, tmp_path / "new")
+    monkeypatch.undo()
+    with zipfile.ZipFile(pack, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("train/street_000/more.npy", bytes(5_000_000))
+    monkeypatch.setattr(pair_pack, "SEQUENCE_BYTES", replace(was, high=5_000_000))
+    with pytest.raises(InputError, match="unpacked size of a sequence"):
+        unpack(pack, tmp_path / "new")
+
+
+def test_a_video_with_more_images_than_stated_is_damaged(pack, tmp_path):
+    with zipfile.ZipFile(pack) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    name = "train/street_000/sequence.json"
+    files[name] = files[name].replace(b"[14, ", b"[13, ")
+    with zipfile.ZipFile(tmp_path / "bad.pack", "w") as archive:
+        for entry, data in files.items():
+            archive.writestr(entry, data)
+    with pytest.raises(InputError, match="more than 13 images"):
+        unpack(tmp_path / "bad.pack", tmp_path / "new")
 
 
 def test_training_needs_nothing_but_the_pack(pack, tmp_path, monkeypatch):
