@@ -27,6 +27,7 @@ from alpasim_plugin.core.types import (
 
 REACH_M = 20_000.0  # of a plan, from where it is made
 LONGEST_S = 600.0  # of a plan; what is longer counts in nanoseconds
+MOST_SAMPLES = 1000  # of a plan: a log holds each at every query
 STALE_S = 10.0  # between now and the first pose that somebody else's clock gave a plan
 ARRAYS = ("times_us", "xy", "yaw")
 UNITS = (
@@ -97,6 +98,8 @@ def _samples_problem(samples: Any, n: int) -> str:
     """Say what keeps the sampled alternatives of a plan of ``n`` poses from being read."""
     if not isinstance(samples, list | tuple):
         return f"samples is {_a(samples)}, not a tuple of arrays"
+    if len(samples) > MOST_SAMPLES:
+        return f"the plan has {len(samples):,} sampled alternatives; {MOST_SAMPLES:,} are the most that a log takes"
     for sample in samples:
         if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
             return f"a sampled alternative is {_a(sample)}, not an array of numbers"

@@ -76,6 +76,9 @@ def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure():
     times_us = np.array([0, 1], dtype=np.int64)
     samples = (np.full((2, 3), 1e30),)
     assert plan_problem(Plan(0, times_us, np.zeros((2, 2)), np.zeros(2), samples=samples), 0)
+    samples = (np.zeros((2, 3)),) * 1001
+    problem = plan_problem(Plan(0, times_us, np.zeros((2, 2)), np.zeros(2), samples=samples), 0)
+    assert "1,001 sampled alternatives" in problem
 
 
 NOW_US = 1_700_000_000_000_000
