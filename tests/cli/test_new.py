@@ -37,11 +37,17 @@ def test_a_template_works_as_it_is_written(kind, tmp_path, monkeypatch, capsys):
     assert "it exists already" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["MyPolicy", "my-policy", "class", "../up", ""])
+@pytest.mark.parametrize("name", ["MyPolicy", "my-policy", "class", "../up"])
 def test_a_name_that_is_no_file_of_python_is_refused(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run_command(["new", "policy", name]) == 2
     assert "not a name of a Python file" in capsys.readouterr().err
+
+
+def test_an_empty_name_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run_command(["new", "policy", ""]) == 2
+    assert "is empty" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
