@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 
 from alpasim_plugin.cli.main import run_command
 from evaluators.statistics.opening import read_run
@@ -24,10 +25,19 @@ def gate_file():
 
 
 def workflow():
-    """Return the words of the two commands of the page's job: drive, and gate."""
-    lines = re.findall(r"- run: simrun (.*)", PAGE.read_text())
-    drive, gate = (shlex.split(line, comments=True) for line in lines)
+    """Return the words of the two commands that the page gives for its job: drive, and gate."""
+    lines = re.findall(r"^simrun (.* runs/change\b.*)", PAGE.read_text(), re.MULTILINE)
+    drive, gate = (shlex.split(line) for line in lines)
     return drive, gate
+
+
+def test_the_page_s_action_is_given_what_its_commands_are():
+    (job, *_) = re.findall(r"```yaml\n(# \.github.*?)```", PAGE.read_text(), re.DOTALL)
+    (step,) = [step for step in yaml.safe_load(job)["jobs"]["drive"]["steps"] if "with" in step]
+    drive, gate = workflow()
+    assert [*shlex.split(step["with"]["drive"]), "--out", "runs/change"] == drive
+    named = ["--gate", step["with"]["gate"], "--baseline-file", step["with"]["baseline-file"]]
+    assert ["gate", "runs/change", *named] == gate
 
 
 @pytest.fixture(scope="module")
