@@ -414,6 +414,7 @@ def check_policy(policy: Policy | str, scenario: Scenario | None = None) -> Repo
         made = make_policy(policy, watched)
     except PolicyError as error:
         return Report((Check("made", False, f"{error.message}; {error.hint}"),))
+    looked_up.discard("route")  # each reset gives that of its situation in its place
     report = _checked(made, scenario, place, looked_up)
     with suppress(SimrunError):  # what it did before is the result
         made.close()

@@ -259,3 +259,9 @@ def test_only_what_the_situations_do_not_have_is_noted_as_looked_up():
     assert watched.looked_up == {"lane_map"}
     copy.copy(watched)
     assert "all" in watched.looked_up
+
+
+def test_a_policy_that_resets_itself_with_the_scenarios_route_is_driven_in_every_situation():
+    report = check_policy("tests.runs.faulty_policies:MirroredImages", load_scenario("smoke/curve"))
+    faults = [check.sentence for check in report.checks if not check.ok]
+    assert any("mirrored" in fault for fault in faults), faults
