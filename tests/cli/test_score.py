@@ -259,7 +259,7 @@ def test_one_damaged_log_does_not_lose_the_others(golden, tmp_path, capsys):
         (logs / name / "rollout.asl").write_bytes(first.read_bytes()[:size])
     out = tmp_path / "scored"
     scene = str(golden / "scenes" / f"{GOLDEN_SCENE}.usdz")
-    assert run_command(["score", str(logs), "--scene", scene, "--out", str(out)]) == 2
+    assert run_command(["score", str(logs), "--scene", scene, "--out", str(out)]) == 4
     found = {row["rollout"]: (row["status"], row["failure_class"]) for row in rows(out)}
     name = first.parent.name  # the session id, of which the second log is another copy
     assert found == {
