@@ -241,7 +241,7 @@ BEFORE_DTYPE = {
 
 
 def positional_dtypes(nodes):
-    """Return the calls whose type of numbers is told from its place alone."""
+    """Return the calls of numpy that give a dtype by position."""
     return [
         f"line {node.lineno}: {ast.unparse(node)}"
         for node in nodes

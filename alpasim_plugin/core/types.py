@@ -418,7 +418,7 @@ class Plan:
     xy: F64  # (T, 2) metres
     yaw: F64  # (T,) radians
     samples: tuple[F64, ...] = ()  # alternatives, each (T, 3): x, y, yaw at times_us
-    # what the policy says of itself; goes to debug.jsonl
+    # diagnostics of the policy, such as scores or detections; stored in debug.jsonl
     debug: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -363,17 +363,6 @@ def unauthenticated(messages: Any, context: Any) -> None:
     context.abort(grpc.StatusCode.UNAUTHENTICATED, "send metadata 'authorization: Bearer TOKEN'")
 
 
-def without_traceback(record: logging.LogRecord) -> bool:
-    """Take the traceback off what gRPC logs of a message that it cannot read, which any client may
-    send; a filter of its log.
-    """
-    if record.exc_info and "deserializing" in str(record.msg):
-        record.exc_info = None
-        record.msg = "a message that is no protobuf of its call: %s"
-        record.args = ("its client speaks another version, or is no client of this service",)
-    return True
-
-
 class Host:
     """A running server.
 
@@ -407,7 +396,6 @@ class Host:
             ("grpc.max_concurrent_streams", STREAMS),
             ("grpc.server_handshake_timeout_ms", round(1000 * HANDSHAKE_S)),
         ]
-        logging.getLogger("grpc._common").addFilter(without_traceback)
         self._gate = gate = Gate(read_token(policy.token_file), workers)
         self._server = grpc.server(
             ThreadPoolExecutor(CALLS, thread_name_prefix="serve"),

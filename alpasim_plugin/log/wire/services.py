@@ -9,10 +9,11 @@ So every file is copied with its package renamed into a separate pool; protobuf'
 holds AlpaSim's names, and AlpaSim's own package can be imported into the same process.
 """
 
+import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import grpc
@@ -23,7 +24,7 @@ from google.protobuf.descriptor_pb2 import (
     ServiceDescriptorProto,
 )
 from google.protobuf.descriptor_pool import DescriptorPool
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
 from . import MODULES, SERVICE_PATHS, reflection_pb2
@@ -54,6 +55,9 @@ OURS = ".simrun.wire."
 V1ALPHA = "/grpc.reflection.v1alpha.ServerReflection/"
 NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
 UNIMPLEMENTED = grpc.StatusCode.UNIMPLEMENTED.value[0]
+UNREADABLE = object()  # in place of a message that cannot be read
+
+log = logging.getLogger("simrun.serve")
 
 
 def channel_options(target: str) -> list[tuple[str, int]]:
@@ -177,12 +181,36 @@ def handlers(
         serve = getattr(implementation, method.name, None)
         if serve is not None:
             handler = getattr(grpc, f"{method.arity}_rpc_method_handler")
+            is_one_message = method.arity.startswith("unary")
             made[method.name] = handler(
-                serve,
-                request_deserializer=method.request.FromString,
+                partial(_answered, serve, method.path) if is_one_message else serve,
+                request_deserializer=(
+                    partial(_read, method.request) if is_one_message else method.request.FromString
+                ),
                 response_serializer=method.response.SerializeToString,
             )
     return grpc.method_handlers_generic_handler((prefix or SERVICE_PATHS[service]).strip("/"), made)
+
+
+def _read(kind: type[Message], data: bytes) -> object:
+    """Return a message, or `UNREADABLE` for what is no message of its kind: gRPC would log each with
+    its traceback, and any client may send some.
+    """
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        return UNREADABLE
+
+
+def _answered(
+    serve: Callable[[Any, Any], Any], path: str, request: object, context: grpc.ServicerContext
+) -> Any:
+    """Answer a call, or refuse one whose message cannot be read."""
+    if request is UNREADABLE:
+        log.warning("%s: a message that is no protobuf of this call", path)
+        text = f"{path}: the message is no protobuf of this call"
+        context.abort(grpc.StatusCode.INVALID_ARGUMENT, text)
+    return serve(request, context)
 
 
 @lru_cache(maxsize=1)
