@@ -32,11 +32,11 @@ from evaluators.statistics.boundary import (
     difference_of,
     median_boundary,
     next_points,
-    seeds_for_median,
     stretches_of,
     widest_gap,
 )
 from evaluators.statistics.boundary_area import AREA_PARTS, AREA_SPACINGS, Lines, claims_of
+from evaluators.statistics.intervals import least_for_median
 from evaluators.statistics.variants import Variant, usual_base, variants_of
 from scenarios.suite import ScenarioRef
 
@@ -389,7 +389,7 @@ class BoundarySearch:
         return facts | {
             "stretches": [vars(stretch) for stretch in stretches_of(outcomes)],
             "median": None if median is None else vars(median),
-            "seeds_for_median": seeds_for_median(),
+            "seeds_for_median": least_for_median(),
         }
 
 

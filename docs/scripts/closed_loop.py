@@ -64,15 +64,23 @@ def numbers_of(entry: Entry, keys: Sequence[str]) -> list[float | None]:
     numbers: list[float | None] = []
     for key in keys:
         value = entry[key]
-        if key == "ci95_clustered" and value is None:
+        is_interval = key == "ci95_clustered" or ("p_value" in keys and key == "ci95")
+        if is_interval and value is None:
             value = [None, None]
         numbers += value if isinstance(value, list) else [value]
     return numbers
 
 
-def printed(value: float | None, scale: float, form: str) -> str:
-    """Print a number; "none" where there is no interval."""
-    return "none" if value is None else format(scale * value, form)
+def bracket(low: float | None, high: float | None, scale: float, form: str) -> str:
+    """Print an interval; nothing where there is none."""
+    if low is None or high is None:
+        return ""
+    return f" [{scale * low:{form}}, {scale * high:{form}}]"
+
+
+def chance(p: float) -> str:
+    """Print a p-value with three digits."""
+    return "< 0.001" if p < 0.0005 else f"{p:.3f}"
 
 
 def tables(policy: str, entry: Entry) -> str:
@@ -81,14 +89,17 @@ def tables(policy: str, entry: Entry) -> str:
     for metric, unit in UNITS.items():
         n, scale = (1, 100) if unit == "%" else (3, 1)
         name = f"`{metric}` ({unit})"
-        cells = [[printed(value, scale, f".{n}f") for value in cell]
-                 for cell in entry["means"][metric].values()]  # fmt: skip
-        means.append(
-            [name, *(f"{mean} ± {half} [{low}, {high}]" for mean, half, low, high in cells)]
-        )
-        cells = [[*(printed(value, scale, f"+.{n}f") for value in bounds), f"{p:.3f}"]
-                 for *bounds, p in entry["minus"][metric].values()]  # fmt: skip
-        minus.append([name, *(f"{diff} [{low}, {high}], p {p}" for diff, low, high, p in cells)])
+        plain, signed = f".{n}f", f"+.{n}f"
+        means.append([
+            name,
+            *(f"{scale * mean:{plain}} ± {scale * half:{plain}}{bracket(low, high, scale, plain)}"
+              for mean, half, low, high in entry["means"][metric].values()),
+        ])  # fmt: skip
+        minus.append([
+            name,
+            *(f"{scale * diff:{signed}}{bracket(low, high, scale, signed)}, p {chance(p)}"
+              for diff, low, high, p in entry["minus"][metric].values()),
+        ])  # fmt: skip
     events = [[family, *(f"{number} of {rollouts}" for number, rollouts in counts.values())]
               for family, counts in entry["events"].items()]  # fmt: skip
     parts = (
@@ -144,7 +155,8 @@ def over_families(events: Entry) -> OverFamilies:
 def sentence(entry: Entry, length: str) -> str:
     """Return README's sentence."""
     share = {name: f"{100 * cell[0]:.1f} %" for name, cell in entry["means"][EVENT].items()}
-    diff, low, high = (f"{100 * bound:+.1f}" for bound in entry["minus"][EVENT][FIXED][:3])
+    diff, low, high, p_value = entry["minus"][EVENT][FIXED]
+    interval = "" if low is None else f", 95 % interval {100 * low:+.1f} to {100 * high:+.1f}"
     over = over_families(entry["events"])
     scenes, seeds, families = entry["scenes"], entry["seeds"], len(entry["events"])
     return (
@@ -152,8 +164,8 @@ def sentence(entry: Entry, length: str) -> str:
         f"two frozen test sets, {families} families, {seeds} seeds), the share that\nleaves the "
         f"road or is at fault in a contact is {share[BASELINE]} behind `{BASELINE}`, "
         f"{share[FIXED]} behind `{FIXED}` and {share[TRUE]} behind `{TRUE}`. `{FIXED}` minus "
-        f"`{BASELINE}`: {diff} points, 95 % interval {low} to {high} over scenes of these "
-        f"families.\n{over.n_better} families are better and {over.n_worse} worse (sign test, p = "
+        f"`{BASELINE}`: {100 * diff:+.1f} points (sign-flip test over scenes, p = {p_value:.3f})"
+        f"{interval}.\n{over.n_better} families are better and {over.n_worse} worse (sign test, p = "
         f"{over.p_value:.3f}); without the one that moves it most, {over.family}, it is "
         f"{over.without_family:+.1f} points. For families that were not driven the interval is wide: "
         f"{over.bounds[0]:+.1f} to {over.bounds[1]:+.1f} "

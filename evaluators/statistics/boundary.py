@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 import numpy as np
-import scipy  # its submodules load on first use; scipy.stats would take a second
 
 from alpasim_plugin.core.types import F64
+from evaluators.statistics.intervals import median_rank
 
 SPACINGS = 16  # between the first points of a range whose key names no spacing
 PARTS = 4  # of a spacing: the distance of neighbours of the grid
-CONFIDENCE = 0.95
 
 Outcomes = Mapping[str, Sequence[Sequence[float]]]  # seed -> driven points, each with its outcome
 
@@ -132,12 +131,8 @@ def widest_gap(outcomes: Outcomes) -> float:
 
 def median_boundary(outcomes: Outcomes) -> Interval | None:
     """Return an interval that holds the median boundary of seeds like these with 95 %, whatever their
-    distribution; None unless each seed changes once, all in the same direction, and there are
-    `seeds_for_median` of them.
-
-    Its ends are order statistics: the r-th lowest and highest of ``n`` values enclose the median
-    unless fewer than r lie on one side of it, which is binomial with a half (David and Nagaraja, Order
-    Statistics, 2003, section 7.1).
+    distribution (`evaluators.statistics.intervals.median_rank`); None unless each seed changes once,
+    all in the same direction, and there are enough of them.
     """
     brackets = []
     directions = set()
@@ -150,24 +145,11 @@ def median_boundary(outcomes: Outcomes) -> Interval | None:
             return None
         brackets.append(changes[0])
         directions.add(failed[changes[0][0]])
-    rank = _rank(len(brackets))
+    rank = median_rank(len(brackets))
     if len(directions) != 1 or rank == 0:
         return None
     lows, highs = (sorted(ends) for ends in zip(*brackets, strict=True))
     return Interval(lows[rank - 1], highs[-rank])
-
-
-def seeds_for_median() -> int:
-    """Return how many seeds give an interval of their median."""
-    return next(number for number in range(1, 100) if _rank(number) > 0)
-
-
-def _rank(seeds: int) -> int:
-    """Return the order statistic, from either end, at which an interval of the median ends; 0 where
-    there are too few seeds.
-    """
-    outside = 2.0 * scipy.special.bdtr(np.arange(seeds), seeds, 0.5)
-    return int(np.sum(outside <= 1.0 - CONFIDENCE))
 
 
 def difference_of(

@@ -127,6 +127,50 @@ def t_half_width(spread: float, n: int) -> float:
     return float(scipy.special.stdtrit(n - 1, 1 - TAIL)) * spread / math.sqrt(n)
 
 
+def median_rank(n: int) -> int:
+    """Return the order statistic, from either end, at which an interval of the median of ``n`` values
+    ends; 0 where there are too few.
+
+    The r-th lowest and highest of ``n`` independent values enclose the median, whatever their
+    distribution, unless fewer than r lie on one side of it, which is binomial with a half (David and
+    Nagaraja, Order Statistics, 2003, section 7.1).
+
+    Example:
+        >>> [median_rank(n) for n in (5, 6, 30)]
+        [0, 1, 10]
+    """
+    outside = 2.0 * scipy.special.bdtr(np.arange(n), n, 0.5)
+    return int(np.sum(outside <= 1.0 - LEVEL))
+
+
+def least_for_median() -> int:
+    """Return how many values give an interval of their median.
+
+    Example:
+        >>> least_for_median()
+        6
+    """
+    return next(number for number in range(1, 100) if median_rank(number) > 0)
+
+
+def median_interval(values: npt.ArrayLike, unit: str = "values") -> Interval:
+    """Return the median of independent ``(n,)`` values and an interval of it that holds whatever their
+    distribution: its ends are order statistics (`median_rank`).
+
+    Example:
+        >>> median_interval([3.0, 1.0, 2.0, 9.0, 4.0, 5.0]).bounds
+        [1.0, 9.0]
+    """
+    order = np.sort(np.asarray(values, dtype=np.float64))
+    centre = float(np.median(order))
+    rank = median_rank(len(order))
+    if rank == 0:
+        reason = f"needs at least {least_for_median()} {unit}, found {len(order)}"
+        return Interval(centre, reason=reason)
+    method = f"order statistics of {unit}"
+    return Interval(centre, float(order[rank - 1]), float(order[-rank]), method=method)
+
+
 def cluster_means(values: npt.ArrayLike, clusters: Sequence[str] | I64) -> tuple[F64, I64]:
     """Return the mean ``(G,)`` and size ``(G,)`` of each cluster; the one partition every statistic
     uses.

@@ -54,13 +54,13 @@ def test_the_bounds_for_other_families_hold_where_one_in_ten_changes_greatly(clo
     assert covered >= 95
 
 
-def test_a_mean_without_an_interval_says_so(closed_loop):
+def test_a_number_without_an_interval_has_no_bracket(closed_loop):
     entry = {"mean": 3.0, "ci95": 0.5, "ci95_clustered": None}
     numbers = closed_loop.numbers_of(entry, ("mean", "ci95", "ci95_clustered"))
     assert numbers == [3.0, 0.5, None, None]
-    assert [closed_loop.printed(number, 1, ".1f") for number in numbers] == [
-        "3.0",
-        "0.5",
-        "none",
-        "none",
-    ]
+    assert closed_loop.bracket(*numbers[2:], 1, ".1f") == ""
+    assert closed_loop.bracket(0.02, 0.031, 100, "+.1f") == " [+2.0, +3.1]"
+    paired = {"diff": -1.0, "ci95": None, "p_value": 0.0001}
+    numbers = closed_loop.numbers_of(paired, ("diff", "ci95", "p_value"))
+    assert numbers == [-1.0, None, None, 0.0001]
+    assert closed_loop.chance(0.0001) == "< 0.001"

@@ -17,11 +17,11 @@ from evaluators.statistics.boundary import (
     median_boundary,
     middles_of_changes,
     next_points,
-    seeds_for_median,
     stretches_of,
     widest_gap,
 )
 from evaluators.statistics.boundary_area import AREA_PARTS, AREA_SPACINGS, claims_of
+from evaluators.statistics.intervals import least_for_median
 
 STEPS = SPACINGS * PARTS
 FIRST = range(0, STEPS + 1, PARTS)
@@ -96,7 +96,7 @@ def test_a_median_needs_six_seeds_that_each_change_once():
     six = {str(number): seed(number + 2) for number in range(6)}
     interval = median_boundary(six)
     assert (interval.low, interval.high) == (1.0, 7.0)  # all values: 1 - 2 / 2^6 = 0.969
-    assert seeds_for_median() == 6
+    assert least_for_median() == 6
     assert median_boundary({name: six[name] for name in list(six)[:5]}) is None
     assert median_boundary(six | {"9": [[0.0, False], [1.0, True], [2.0, False]]}) is None
     assert median_boundary(six | {"9": [[0.0, False], [1.0, True]]}) is None  # another direction

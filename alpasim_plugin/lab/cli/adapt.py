@@ -63,8 +63,10 @@ def adapt(
         seed=seed,
         report=progress.update,
     )
-    low, high = done.ci95_db
-    gain_text = f"{done.gain_db:+.2f} dB ({low:+.2f} to {high:+.2f}) over {len(done.after)} held-out photographs"
+    gain_text = (
+        f"{done.gain_db:+.2f} dB in the mean of {len(done.after)} held-out photographs, "
+        f"{done.n_better} of which gain"
+    )
     verdict = (
         f"accepted: {gain_text}; wrote {out}"
         if done.accepted

@@ -92,9 +92,11 @@ def real(
         return
     print_rows(rows, False)
     if over:
-        print_rows(
-            [{**row, "ci95": "{:.3g} to {:.3g}".format(*row["ci95"])} for row in over], False
-        )
+        print_rows([{**row, "median_ci95": _range_text(row["median_ci95"])} for row in over], False)
+
+
+def _range_text(bounds: Sequence[float] | None) -> str | None:
+    return None if bounds is None else "{:.3g} to {:.3g}".format(*bounds)
 
 
 def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:

@@ -1,5 +1,8 @@
-"""From clips to a table: means with t intervals over clips, and differences from a baseline clip by
-clip.
+"""From clips to a table: means with standard deviations over clips, and differences from a baseline
+clip by clip.
+
+Nothing bounds these metrics, so that no sample bounds their mean over other clips: the interval of a
+difference is that of its median, by order statistics, which hold whatever the distribution.
 
 A row is one clip under one variant: ``arm``, ``clip``, ``values`` (metric -> number),
 ``ms_per_frame`` (of later blocks; empty where no fixer ran), ``frames``, ``identical``, ``events``.
@@ -15,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.lab.video_metrics.facts import FACTS, MS
-from evaluators.statistics.intervals import t_interval
+from evaluators.statistics.intervals import median_interval
 
 Row = Mapping[str, Any]
 TRUTH = "truth"  # the variant of the clean frames: it has only metrics without a reference
@@ -29,9 +32,11 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         baseline: Variant that the others are compared with, clip by clip.
 
     Returns:
-        ``baseline``; ``arms``: VARIANT -> METRIC -> ``mean``, ``ci95`` ([low, high], t over clips,
-        or None with ``reason``), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
-        ``diff``, ``ci95``, ``n``; ``identical``, ``events``, ``frames``, ``clips`` by variant.
+        ``baseline``; ``arms``: VARIANT -> METRIC -> ``mean``, ``spread`` (standard deviation over
+        clips; None of one), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
+        ``diff`` (the mean), ``spread``, ``median``, ``median_ci95`` ([low, high], or None with
+        ``reason``), ``n_better``, ``n_worse``, ``n``; ``identical``, ``events``, ``frames``,
+        ``clips`` by variant.
 
     Raises:
         EvaluatorError: No row of the baseline.
@@ -80,18 +85,30 @@ def _carries(row: Row, metric: str) -> bool:
 
 
 def _mean(values: Sequence[float], metric: str) -> dict[str, Any]:
-    interval = t_interval(values, "clips")
     fact = FACTS[metric]
-    entry: dict[str, Any] = {"mean": interval.centre, "ci95": interval.bounds, "n": len(values)}
-    entry |= {"unit": fact.unit, "direction": fact.direction}
-    return entry | ({"reason": interval.reason} if interval.reason else {})
+    entry = {"mean": float(np.mean(values)), "spread": _spread(values), "n": len(values)}
+    return entry | {"unit": fact.unit, "direction": fact.direction}
+
+
+def _spread(values: Sequence[float]) -> float | None:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
 def _paired(rows: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, Any]:
     pairs = [(rows[clip], baseline[clip]) for clip in rows if clip in baseline]
     out: dict[str, Any] = {}
     for metric in metrics_of([row for pair in pairs for row in pair]):
-        differences = [value_of(a, metric) - value_of(b, metric) for a, b in pairs]
-        interval = t_interval(differences, "clips")
-        out[metric] = {"diff": interval.centre, "ci95": interval.bounds, "n": len(differences)}
+        differences = np.array([value_of(a, metric) - value_of(b, metric) for a, b in pairs])
+        gains = differences if FACTS[metric].direction == "higher" else -differences
+        interval = median_interval(differences, "clips")
+        out[metric] = {
+            "diff": float(np.mean(differences)),
+            "spread": _spread(differences.tolist()),
+            "median": interval.centre,
+            "median_ci95": interval.bounds,
+            **({"reason": interval.reason} if interval.reason else {}),
+            "n_better": int(np.sum(gains > 0.0)),
+            "n_worse": int(np.sum(gains < 0.0)),
+            "n": len(differences),
+        }
     return out

@@ -14,8 +14,8 @@ def markdown(summary: Mapping[str, Any]) -> str:
     """Return two tables of a summary (`alpasim_plugin.lab.video_metrics.summary.summarise`): means,
     and differences from the baseline.
 
-    Cells are mean and half-width of the 95 % t interval over clips. A difference is bold if its
-    interval excludes zero.
+    Cells are the mean and, in brackets, the standard deviation over clips; of differences the mean
+    and, in brackets, the 95 % interval of the median, bold where it excludes zero.
     """
     arms = summary["arms"]
     paired = summary["paired"]
@@ -43,13 +43,19 @@ def _cell(metric: str, entry: Mapping[str, Any] | None) -> str:
         return ""
     fact = FACTS[metric]
     is_difference = "diff" in entry
-    value = entry["diff" if is_difference else "mean"] * fact.scale
-    text = f"{value:{'+' if is_difference else ''}.{fact.digits}f}"
-    if entry["ci95"] is None:
+    sign = "+" if is_difference else ""
+
+    def words(value: float, sign: str = sign) -> str:
+        return f"{value * fact.scale:{sign}.{fact.digits}f}"
+
+    text = words(entry["diff" if is_difference else "mean"])
+    if not is_difference:
+        return text if entry["spread"] is None else f"{text} ({words(entry['spread'])})"
+    if entry["median_ci95"] is None:
         return text
-    low, high = entry["ci95"]
-    text += f" \u00b1 {(high - low) / 2 * fact.scale:.{fact.digits}f}"
-    return f"**{text}**" if is_difference and low * high > 0 else text
+    low, high = entry["median_ci95"]
+    text += f" ({words(low)} to {words(high)})"
+    return f"**{text}**" if low * high > 0 else text
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

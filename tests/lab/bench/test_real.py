@@ -89,10 +89,11 @@ def test_the_model_is_near_its_photographs_and_a_second_drive_gives_intervals(
     )
     assert found["drives"] == 2
     assert found["mean"] == pytest.approx(float(rows[0]["psnr_db"]) + 1.0)  # type: ignore[arg-type]
-    low, high = found["ci95"]  # type: ignore[misc]
-    assert (high - low) / 2 == pytest.approx(12.706, rel=1e-3), (
-        "Student's t of one degree of freedom, spread of the mean 1"
-    )
+    assert found["median_ci95"] is None, "two drives bound nothing"
+    six = [{**row, "drive": n, "psnr_db": n * n} for n in range(6) for row in rows]
+    wide = next(row for row in intervals(six) if row["metric"] == "psnr_db")
+    assert (wide["mean"], wide["median"]) == (pytest.approx(55 / 6), 6.5)
+    assert wide["median_ci95"] == [0.0, 25.0], "the least and the greatest of six hold it in 97 %"
 
 
 def test_what_cannot_be_measured_is_refused(drive):

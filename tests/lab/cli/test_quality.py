@@ -21,6 +21,7 @@ from alpasim_plugin.lab.cli.bench_quality import parse_variants
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
 from alpasim_plugin.lab.video_metrics.summary import summarise
+from alpasim_plugin.lab.video_metrics.table import markdown
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
 
@@ -175,16 +176,24 @@ def row(variant, clip, psnr, frames=200):
     }
 
 
-def test_intervals_are_over_clips_and_pairs_are_sharper():
-    rows = [row("3dgs", c, p) for c, p in zip("abcd", (20, 22, 24, 30), strict=True)]
-    rows += [row("f", c, p) for c, p in zip("abcd", (21.0, 23.1, 25.0, 31.1), strict=True)]
+def test_means_have_a_spread_over_clips_and_differences_an_interval_of_their_median():
+    rows = [row("3dgs", c, p) for c, p in zip("abcdef", (20, 22, 24, 30, 24, 24), strict=True)]
+    fixed = (21.0, 23.1, 25.0, 31.1, 25.2, 23.9)
+    rows += [row("f", c, p) for c, p in zip("abcdef", fixed, strict=True)]
     found = summarise(rows, "3dgs")
-    low, high = found["arms"]["3dgs"]["psnr_db"]["ci95"]
-    assert found["arms"]["3dgs"]["psnr_db"]["mean"] == 24.0
-    assert (high - low) / 2 == pytest.approx(3.182446 * np.std([20, 22, 24, 30], ddof=1) / 2)
+    arm = found["arms"]["3dgs"]["psnr_db"]
+    assert (arm["mean"], arm["n"]) == (24.0, 6)
+    assert arm["spread"] == pytest.approx(np.std([20, 22, 24, 30, 24, 24], ddof=1))
     pair = found["paired"]["f"]["psnr_db"]
-    assert pair["diff"] == pytest.approx(1.05)
-    assert pair["ci95"][0] > 0
+    assert pair["diff"] == pytest.approx(5.3 / 6)
+    assert pair["median"] == pytest.approx(1.05)
+    assert pair["median_ci95"] == pytest.approx([-0.1, 1.2])
+    assert (pair["n_better"], pair["n_worse"], pair["n"]) == (5, 1, 6)
+    assert "| f | +0.88 (-0.10 to +1.20) |" in markdown(found)
+    assert "| 3dgs | 24.00 (3.35) |" in markdown(found)
+    few = summarise([row for row in rows if row["clip"] in "ab"], "3dgs")["paired"]["f"]["psnr_db"]
+    assert few["median_ci95"] is None
+    assert few["reason"] == "needs at least 6 clips, found 2"
     with pytest.raises(EvaluatorError):
         summarise(rows, "x")
 

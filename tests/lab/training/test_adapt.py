@@ -32,12 +32,20 @@ def shipped():
     return Path(str(fixer_settings("onefixer", []).weights.bundle))  # type: ignore[attr-defined]
 
 
-def test_a_gain_is_accepted_where_chance_does_not_explain_it():
+def test_a_gain_is_accepted_where_most_photographs_have_it():
     before = np.linspace(20, 25, 8)
     assert compared(before, before + np.linspace(0.1, 0.3, 8)).accepted
     assert not compared(before, before + np.array([0.5, -0.5] * 4)).accepted
     assert not compared(before, before - 0.2).accepted
     assert not compared(before, before).accepted
+    # one photograph that gains 9 dB moves the mean, and is one of eight
+    few = compared(before, before + np.array([9.0] + [-0.1] * 7))
+    assert few.gain_db > 1.0
+    assert few.n_better == 1
+    assert not few.accepted
+    most = compared(before, before + np.array([0.1] * 6 + [-0.05] * 2))
+    assert most.n_better == 6
+    assert most.accepted
 
 
 def test_a_drive_without_enough_photographs_is_refused_and_nothing_is_written(
@@ -59,7 +67,10 @@ def test_the_command_trains_judges_and_keeps_what_there_was(tmp_path, monkeypatc
     )
     document = json.loads(capsys.readouterr().out)
     assert len(document["before"]) == len(document["after"]) == 5
-    assert document["accepted"] == (document["ci95_db"][0] > 0) == out.exists()
+    assert document["accepted"] == out.exists()
+    gains = np.subtract(document["after"], document["before"])
+    assert document["gain_db"] == pytest.approx(gains.mean())
+    assert document["n_better"] == (gains > 0).sum()
     out.write_bytes(b"mine")
     assert run_command(["train", "adapt", str(tmp_path), "--out", str(out)]) == 2
     assert out.read_bytes() == b"mine"
