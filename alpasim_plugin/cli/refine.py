@@ -34,7 +34,7 @@ def refine(
         Path | None, Flag("Grey, white where the input is reliable; in the input's form.")
     ] = None,
     sdmap: Annotated[
-        Path | None, Flag("Semantic map (docs/fixers.md), in the input's form.")
+        Path | None, Flag("Semantic map (docs/how-the-fixer-works.md), in the input's form.")
     ] = None,
     fixer: Annotated[str, Flag("A fixer (`simrun list fixers`), or NAME@STEPS.")] = "onefixer",
     overrides: Annotated[

@@ -1,7 +1,7 @@
 """Gymnasium environments over the closed loop: ``import alpasim_plugin.gym`` registers
 ``simrun/Drive-v0`` and ``simrun/Plan-v0``.
 
-Needs the extra ``gym``. See docs/policies.md.
+Needs the extra ``gym``. See docs/gym.md.
 """
 
 from alpasim_plugin.core.errors import InputError

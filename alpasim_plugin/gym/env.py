@@ -386,4 +386,4 @@ def _check(
     }
     for argument, wrong in faults.items():
         if wrong:
-            raise InputError(f"an environment cannot have {argument}", "see docs/policies.md")
+            raise InputError(f"an environment cannot have {argument}", "see docs/gym.md")

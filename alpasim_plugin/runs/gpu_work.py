@@ -47,7 +47,7 @@ class Work(NamedTuple):
         return round(max(self.gflop / rate, 1e3 * self.gb / memory), 3)
 
 
-# As the laboratory counts them (docs/gpu.md): a frame of `transparent_splats` at 1920x1080, and at
+# As the laboratory counts them (docs/experiments/gpu.md): a frame of `transparent_splats` at 1920x1080, and at
 # 960x544 a frame of ``onefixer`` with two recorded images a camera.
 COUNTED = {
     "splats": Work(19.45, 0.959),

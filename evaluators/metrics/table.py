@@ -235,7 +235,7 @@ METRICS = MetricTable(
             is_headline=True,
             label="at-fault collisions",
             reference=FOOTPRINT,
-            formula="`collision_front` or `collision_lateral`; `strict`: [at fault](metrics.md#contact-in-preset-strict)",
+            formula="`collision_front` or `collision_lateral`; `strict`: [at fault](fault.md#contact-in-preset-strict)",
         ),
         "collision_any": _flag(
             "any contact with another actor",
@@ -307,7 +307,7 @@ METRICS = MetricTable(
             is_headline=True,
             label="off-road rollouts",
             reference=FOOTPRINT,
-            formula="[contact and off-road](metrics.md#off-road)",
+            formula="[contact and off-road](fault.md#off-road)",
             invalid="no lanes; or an edge is needed and the map has none",
         ),
         "offroad_margin_m": _metres(
@@ -410,14 +410,14 @@ METRICS = MetricTable(
             label="stalled rollouts",
             reference=CENTRE,
             invalid=_SHORT,
-            formula="[stalled and braked without a cause](report.md#how-a-rollout-ends)",
+            formula="[stalled and braked without a cause](outcomes.md)",
         ),
         "braked_without_cause": _flag(
             "the ego drives at less than half the speed of the recording there, which it had before, although nothing is in its way; not behind the recording's end",
             label="rollouts that braked without a cause",
             reference=CENTRE,
             invalid=_SHORT,
-            formula="[stalled and braked without a cause](report.md#how-a-rollout-ends)",
+            formula="[stalled and braked without a cause](outcomes.md)",
         ),
         "hard_brake": _flag(
             "the ego brakes harder than 4.05 m/s2",

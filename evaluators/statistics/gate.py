@@ -1,4 +1,4 @@
-"""The gate: margins and limits as YAML (docs/ci.md); its verdict on a run, and the outcome that
+"""The gate: margins and limits as YAML (docs/gate-file.md); its verdict on a run, and the outcome that
 follows.
 
 A gate is about its suite (`evaluators.statistics.suite`), or about the scenes that the suite's

@@ -92,7 +92,7 @@ def test_the_rollout_by_hand_of_the_api_page_runs(repo, capsys):
 
 
 def test_every_environment_variable_of_ours_is_on_a_page(repo):
-    page = (repo / "docs" / "install.md").read_text()
+    page = (repo / "docs" / "environment.md").read_text()
     variables = set()
     for folder in ("alpasim_plugin", "evaluators", "policies", "scenarios"):
         for path in (repo / folder).rglob("*.py"):

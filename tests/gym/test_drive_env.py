@@ -234,7 +234,7 @@ def blocks(name):
 @pytest.mark.slow
 def test_the_example_of_the_page_runs():
     space = {}
-    exec(compile(blocks("policies.md")[-1], "docs/policies.md", "exec"), space)
+    exec(compile(blocks("gym.md")[-1], "docs/gym.md", "exec"), space)
     assert space["seen"]["camera"].shape == (54, 96, 3)
 
 

@@ -177,7 +177,7 @@ def read_posed_photographs(
     """
     path = folder / FILE
     document = read_json_object(
-        path, do_this=f"give a folder with images and their {FILE} (docs/renderers.md)"
+        path, do_this=f"give a folder with images and their {FILE} (docs/real-drives.md)"
     )
     listed = as_shape(list[JsonObject], document.get("frames") or [], f"{path}, key 'frames'")
     frames = [{**document, **frame} for frame in listed]
@@ -357,7 +357,7 @@ def _lens(frame: Mapping[str, Any], file: Path, location: str) -> Lens:
             f"{location}: {others[0] if others else 'distortion_params'} of a lens model {model}",
             f"give it by {', '.join(COEFFICIENTS[model]) or 'none'}, or {undistort}",
         )
-    do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/renderers.md)"
+    do = "give w, h, fl_x, fl_y, cx and cy in pixels, and k1, k2, p1, p2 where the lens bends lines (docs/real-drives.md)"
     try:
         width, height = _image_size(frame, file)
         fl_x, fl_y = _focal_lengths(frame, width, height)
