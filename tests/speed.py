@@ -1,4 +1,5 @@
-"""What a frame costs here and at another commit, in pairs: ``python -m tests.speed BASE``.
+"""What a frame and the main job cost here and at another commit, in pairs: ``python -m tests.speed
+BASE``.
 
 Processes of both commits take turns on one thread, by processor time, so that a busy machine slows
 both; a ratio is the median of those of the pairs. Numbers are printed and nothing is judged by them.
@@ -73,6 +74,19 @@ for count, width, height in ((100_000, 480, 272), (500_000, 960, 544)):
     costs[f"rasteriser: {count:,} splats at {width}x{height}"] = 1e3 * min(spent)
 print(json.dumps(costs))
 """
+# A whole warm command, in one process so that all of its processor time is counted.
+JOB = """
+import json, resource, subprocess, sys, tempfile
+names = ",".join(sys.argv[1:])
+command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", names]
+command += ["--policy", "lane-camera", "--workers", "1", "smoke/curve", "--out"]
+with tempfile.TemporaryDirectory() as folder:
+    done = subprocess.run([*command, folder + "/run"], capture_output=True, text=True)
+if done.returncode not in (0, 1):
+    sys.exit(done.stderr)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps({"main job": 1e3 * (used.ru_utime + used.ru_stime)}))
+"""
 
 
 @contextmanager
@@ -97,7 +111,7 @@ def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> 
     threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     environment = os.environ | threads | {"PYTHONPATH": str(tree), "SIMRUN_CACHE": str(cache)}
     costs: dict[str, float] = {}
-    for script, arguments in ((RASTER, ()), (LOOP, renderers)):
+    for script, arguments in ((RASTER, ()), (LOOP, renderers), (JOB, renderers)):
         command = [python, "-c", script, *arguments]
         done = subprocess.run(
             command, check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=cache

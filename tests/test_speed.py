@@ -11,6 +11,6 @@ def test_the_table_is_of_medians_of_what_both_commits_measure():
     assert speed.table(pairs).splitlines()[2:] == ["| a | 1.0 | 2.0 | 2.00 | 2.00 | 2.00 |"]
 
 
-def test_both_scripts_are_python():
-    for script in (speed.LOOP, speed.RASTER):
+def test_its_scripts_are_python():
+    for script in (speed.LOOP, speed.RASTER, speed.JOB):
         compile(script, "a script", "exec")
