@@ -80,8 +80,7 @@ class SkyMask:
         is_open = np.ones(share.shape, dtype=np.bool_)
         for i in self._in_order(camera, name)[:MOST_VIEWS]:
             sky, is_seen = _carried(self._views[i], camera)
-            taken = is_open & is_seen
-            share[taken] = sky[taken]
+            np.copyto(share, sky, where=is_open & is_seen)
             is_open &= ~is_seen
             if not is_open.any():
                 break
@@ -148,14 +147,18 @@ def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    is_inside = cv2.warpPerspective(
+    inside = cv2.warpPerspective(
         np.ones(view.sky.shape, dtype=np.uint8),
         to_view,
         size,
         flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT,
     )
+    is_seen: Bool = inside.view(np.bool_)
+    # What lies behind the view is not seen; depth is linear, so corners tell whether any does.
     columns = np.arange(camera.width)
     rows = np.arange(camera.height)[:, None]
-    depth = to_view[2, 0] * columns + to_view[2, 1] * rows + to_view[2, 2]
-    return interpolated, (is_inside > 0) & (depth > 0)
+    corners = to_view[2, 0] * columns[[0, -1]] + to_view[2, 1] * rows[[0, -1]] + to_view[2, 2]
+    if corners.min() <= 0:
+        is_seen &= to_view[2, 0] * columns + to_view[2, 1] * rows + to_view[2, 2] > 0
+    return interpolated, is_seen
