@@ -210,6 +210,7 @@ def test_left_overs_of_killed_writers_are_removed_and_nothing_else(root):
         named(os.getppid()),
         root / CELL / ".a.json.12.tmp",
         root / CELL / "note.tmp",
+        named("9" * 30),
         root / "forks" / "f" / named(2**22 + 1).name,
     ]
     kept[-1].parent.mkdir(parents=True)

@@ -1,8 +1,8 @@
 """Write files atomically: under a temporary name in the same folder, then renamed, so that a reader
 never sees an incomplete file.
 
-A process that is killed leaves at most a hidden ``.NAME.PID.RANDOM.tmp`` behind; what stood at the
-path before is untouched.
+A process that is killed leaves at most a hidden ``.NAME.PID.MACHINE.tmp`` behind, which the next
+process that writes into the folder removes; what stood at the path before is untouched.
 """
 
 from __future__ import annotations
@@ -12,10 +12,14 @@ import ctypes
 import errno
 import json
 import os
+import platform
+import re
 import shutil
 import time
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +34,9 @@ BACKUP = ".simrun-backup"
 MOMENT_S = 0.4  # for a process between the two renames of a folder
 WORKING_FOLDER = -100  # of Linux's renameat2, like the next
 EXCHANGE = 2
+# The number of a process, its machine, and what is different at every call.
+TEMPORARY = re.compile(r"\..+\.(\d{1,9})\.([0-9a-f]{8})[0-9a-f]{8}\.tmp")
+OWN_PROCESSES = "/proc/self/ns/pid"  # on Linux: where process numbers are those of this process
 NO_PATH = (errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.EEXIST)
 
 
@@ -47,8 +54,57 @@ def disk_error(path: Path, error: OSError, do_this: str | None = None) -> Simrun
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a hidden name in the same folder, different in every process and for every call."""
-    return path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}.tmp")
+    """Return a hidden name in the same folder, different in every process and for every call.
+
+    At the first one in a folder, what killed processes of this machine left there is removed.
+    """
+    _tidy(path.parent)
+    return path.with_name(f".{path.name}.{os.getpid()}.{_machine()}{os.urandom(4).hex()}.tmp")
+
+
+_tidied: set[str] = set()  # folders, by this process
+
+
+def _tidy(folder: Path) -> None:
+    """Remove what killed processes of this machine left in a folder, once a process."""
+    place = os.path.abspath(folder)
+    if place in _tidied:
+        return
+    _tidied.add(place)
+    with contextlib.suppress(OSError):  # it cannot be read: the write that follows says why
+        for name in os.listdir(folder):
+            if is_left_over(name):
+                with contextlib.suppress(OSError):  # another process has removed it just now
+                    remove(folder / name)
+
+
+def is_left_over(name: str, of_any_machine: bool = False) -> bool:
+    """Tell whether a file or folder has a temporary name of a process that is gone.
+
+    Args:
+        name: Without its folder.
+        of_any_machine: Whoever holds the lock of a folder knows that no other machine writes there;
+            else only names that this machine gave are told.
+    """
+    matched = TEMPORARY.fullmatch(name)
+    if matched is None or not (of_any_machine or matched[2] == _machine()):
+        return False
+    try:
+        os.kill(int(matched[1]), 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):  # another user's, or no number of a process
+        return False
+    return False
+
+
+@cache
+def _machine() -> str:
+    """Return eight digits that differ where process numbers mean other processes."""
+    namespace = 0
+    with contextlib.suppress(OSError):
+        namespace = os.stat(OWN_PROCESSES).st_ino
+    return f"{zlib.crc32(f'{platform.node()} {namespace}'.encode()):08x}"
 
 
 @contextmanager
@@ -102,7 +158,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
         if not os.path.exists(folder):
             partial.replace(folder)
         elif not _change_places(partial, folder):
-            _remove(old)
+            remove(old)
             folder.replace(old)
             partial.replace(folder)
     except OSError as error:
@@ -110,9 +166,9 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
             restore_folder(folder)
         raise disk_error(folder, error) from error
     finally:
-        _remove(partial)
+        remove(partial)
         if os.path.exists(folder):
-            _remove(old)
+            remove(old)
 
 
 def _change_places(first: Path, second: Path) -> bool:
@@ -127,12 +183,12 @@ def _change_places(first: Path, second: Path) -> bool:
     return bool(rename(WORKING_FOLDER, paths[0], WORKING_FOLDER, paths[1], EXCHANGE) == 0)
 
 
-def _remove(path: Path) -> None:
-    """Remove a folder, or a link to one, if it is there."""
-    if os.path.islink(path):
-        path.unlink(missing_ok=True)
-    else:
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with all that it holds, if it is there."""
+    if os.path.isdir(path) and not os.path.islink(path):
         shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _backup_of(folder: Path) -> Path:

@@ -3,8 +3,6 @@ from the rollouts' manifests.
 """
 
 import os
-import re
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files.atomic import atomic_file, write_bytes, write_json
+from alpasim_plugin.core.files.atomic import (
+    atomic_file,
+    is_left_over,
+    remove,
+    write_bytes,
+    write_json,
+)
 from alpasim_plugin.core.files.lock import one_writer
 from alpasim_plugin.core.files.tables import read_parquet
 from alpasim_plugin.core.geometry import yaw_from_quat
@@ -39,9 +43,6 @@ from alpasim_plugin.log.run_folder.schema import (
 ACTOR_STEP_US = 250_000
 GROUP_ROWS = 1 << 20  # rows of a row group: what is held in memory
 CHUNK_ROWS = 4096  # rows that are held as dictionaries, which take ten times the memory
-_TEMPORARY = re.compile(
-    r"\..+\.(\d+)\.[0-9a-f]{8}\.tmp"
-)  # as `alpasim_plugin.core.files.atomic.temporary_path` makes them
 
 
 @contextmanager
@@ -90,17 +91,14 @@ def remove_left_overs(root: Path, before_ns: int | None = None) -> list[Path]:
             folders.clear()
             continue
         for name in [*files, *folders]:
-            matched = _TEMPORARY.fullmatch(name)
-            if matched is None or _is_running(int(matched[1])):
+            if not is_left_over(name, of_any_machine=True):
                 continue
             path = parent / name
             if before_ns is not None and path.lstat().st_mtime_ns >= before_ns:
                 continue
             if os.path.isdir(path) and not os.path.islink(path):
-                shutil.rmtree(path)
                 folders.remove(name)
-            else:
-                path.unlink()
+            remove(path)
             removed.append(path)
     return removed
 
@@ -300,14 +298,3 @@ def _actor(scenario: Scenario | LoggedScene, actor: Actor) -> JsonObject:
 
 def _xy(line: F64) -> list[list[float]]:
     return np.round(line[:, :2], 2).tolist()
-
-
-def _is_running(pid: int) -> bool:
-    """Tell whether this machine has a process of this number."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # another user's
-        return True
-    return True

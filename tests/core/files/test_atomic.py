@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -83,6 +84,14 @@ def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path):
     )
     assert subprocess.run([sys.executable, "-c", code, str(path)], check=False).returncode == -9
     assert json.loads(path.read_text()) == {"run": 1}
+    (left,) = set(tmp_path.iterdir()) - {path}
+    here = f".{left.name.split('.')[-2][:8]}"
+    others = [left.name.replace(here, ".01234567"), re.sub(r"\.\d+\.", f".{'9' * 30}.", left.name)]
+    for name in others:  # of another machine, and of no process
+        (tmp_path / name).touch()
+    code = code.replace("os.kill", "print")
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "b.json")], check=True)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"a.json", "b.json", *others}
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), KeyboardInterrupt()])
