@@ -13,7 +13,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
@@ -23,6 +24,9 @@ from alpasim_plugin.core.cores import system_lines
 SAFE_PATH = "PYTHONSAFEPATH"  # keeps Python from importing from the working directory
 OURS = "simrun"  # our value of it
 SET_CHILD_SUBREAPER = 36  # of prctl(2)
+ENDED = "ZXx"  # states of a process
+GENERATIONS = 100  # of orphans, at most
+MOMENT_S = 0.01
 ORPHANED = 70  # exit code of a worker whose parent is gone (EX_SOFTWARE)
 MOST_BYTES = 4 << 20  # of one rollout, and of what is printed outside of them
 LEFT_OUT = "\n(the rest is left out)\n"
@@ -74,6 +78,11 @@ def lead_group() -> None:
     if not hasattr(os, "setpgid"):
         return
     os.setpgid(0, 0)
+    adopt_orphans()
+
+
+def adopt_orphans() -> None:
+    """On Linux, become the parent of each process below this one whose own parent has ended."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
@@ -98,11 +107,34 @@ def end_descendants() -> None:
                 os.kill(pid, signal.SIGKILL)
 
 
+def end_orphans(parent: int, kept: Collection[int]) -> None:
+    """End the processes that have come to a parent because their own has ended, and what comes after
+    them in the same way; on Linux.
+
+    Args:
+        parent: A process that has called `adopt_orphans`.
+        kept: Its own children.
+    """
+    for _ in range(GENERATIONS):
+        orphans = {pid for pid, its_parent in _processes() if its_parent == parent}.difference(kept)
+        if not orphans:
+            return
+        for pid in orphans:
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(MOMENT_S)  # until they have handed on their children
+
+
+def parent_of(pid: int) -> int | None:
+    """Return the parent of a process, where the system lists them; None where it has ended."""
+    return dict(_processes()).get(pid)
+
+
 def _processes() -> Iterator[tuple[int, int]]:
     """Yield the processes of this machine, each with its parent, where the system lists them."""
     for folder in Path("/proc").glob("[0-9]*"):
         facts = "".join(system_lines(folder / "stat")).rpartition(")")[2].split()
-        if facts:  # else it has ended meanwhile
+        if facts and facts[0] not in ENDED:  # no facts: it has ended meanwhile
             yield int(folder.name), int(facts[1])
 
 
@@ -114,6 +146,7 @@ def end_with_parent() -> None:
 
     def watch() -> None:
         parent.join()
+        end_descendants()
         if hasattr(os, "getpgrp") and os.getpgrp() == os.getpid():
             end_group(os.getpid())
         os._exit(ORPHANED)

@@ -12,6 +12,7 @@ import pickle
 import signal
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections import deque
@@ -33,11 +34,14 @@ from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.subprocesses import (
     end_descendants,
     end_group,
+    end_orphans,
     end_with_parent,
     forget_safe_path,
     lead_group,
+    parent_of,
     safe_path,
 )
+from alpasim_plugin.runs.forked_from import VARIABLE
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -54,6 +58,7 @@ THREAD_VARIABLES = (
 )
 # Loaded once, by the process that workers are forked from.
 PRELOAD = (
+    "alpasim_plugin.runs.forked_from",
     "alpasim_plugin.control.tracker",
     "alpasim_plugin.renderers.gaussian",
     "alpasim_plugin.runs.execute",
@@ -174,6 +179,10 @@ def apart(
     return result
 
 
+_starting = threading.Lock()  # while a worker is started, it is no orphan
+_running: set[int] = set()  # workers of this process
+
+
 class _Worker:
     """A process that does one job at a time.
 
@@ -195,9 +204,11 @@ class _Worker:
         context = _context(threads)
         self.connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, note))  # type: ignore[attr-defined]
-        with _environment(threads):
+        with _starting, _environment(threads):
             self._process.start()
+            _running.add(self._process.pid)
         theirs.close()
+        self._forked_from = parent_of(self._process.pid)
 
     def give(self, work: Callable[[Any], Any], job: Any, limit_s: float | None, parts: str) -> None:
         """Hand over a job."""
@@ -288,8 +299,11 @@ class _Worker:
 
     def _end_group(self) -> None:
         """End what parts have started in the process and left behind."""
-        if self._process.pid is not None:
-            end_group(self._process.pid)
+        end_group(self._process.pid)
+        with _starting:
+            _running.discard(self._process.pid)
+            if self._forked_from not in (None, os.getpid()):
+                end_orphans(self._forked_from, _running)
 
 
 class _Pool(Generic[J, R]):
@@ -430,7 +444,8 @@ def _environment(threads: int) -> Iterator[None]:
     nothing is imported from the working directory.
     """
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    before[VARIABLE] = os.environ.get(VARIABLE)
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)), **{VARIABLE: "1"})
     try:
         with safe_path():
             yield

@@ -148,7 +148,7 @@ def leave_a_process(item):
     receiver, sender = os.pipe()
     child = os.fork()
     if child == 0:
-        if item == "session":
+        if item.endswith("session"):
             os.setsid()
         if item == "orphan" and os.fork():
             os._exit(0)
@@ -161,6 +161,10 @@ def leave_a_process(item):
             print(left, file=numbers)
         os.kill(os.getpid(), signal.SIGKILL)
     return left
+
+
+def leave_a_process_or_work(item):
+    return leave_a_process(item) if os.path.isabs(item) else work(item)
 
 
 def is_running(process):
@@ -188,10 +192,13 @@ def test_what_a_job_leaves_running_ends_with_its_worker():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it finds processes in /proc")
-def test_what_a_job_leaves_running_ends_with_a_worker_that_dies(tmp_path):
-    numbers = tmp_path / "numbers"
-    ((_, lost),) = run_jobs(leave_a_process, [str(numbers)], 1, limit_s=60.0)
-    assert isinstance(lost, Lost)
+@pytest.mark.parametrize("name", ["numbers", "session"])
+def test_what_a_job_leaves_running_ends_with_a_worker_that_dies(tmp_path, name):
+    numbers = tmp_path / name
+    jobs = ["a", str(numbers), "b"]  # one worker of the others lives on
+    results = dict(run_jobs(leave_a_process_or_work, jobs, 2, limit_s=60.0))
+    assert isinstance(results.pop(str(numbers)), Lost)
+    assert results == {"a": "A", "b": "B"}
     left = [int(line) for line in numbers.read_text().split()]
     assert left
     assert all(map(is_gone, left))
