@@ -18,7 +18,7 @@ from alpasim_plugin.core.types import (
     Behaviour,
     Bool,
     Box,
-    Signal,
+    LaneMap,
     Trajectory,
     Vehicle,
 )
@@ -198,8 +198,7 @@ def drive(
     scripts: Sequence[Actor],
     followers: Sequence[Follower],
     end_us: int,
-    signals: Sequence[Signal] | None = None,
-    give_way: Sequence[Signal] = (),
+    lane_map: LaneMap | None = None,
     posted_mps: F64 | None = None,
 ) -> tuple[Trajectory, tuple[Actor, ...]]:
     """Drive from time 0 to ``end_us``, or to the end of the path.
@@ -212,22 +211,15 @@ def drive(
         scripts: Tracks known in advance.
         followers: Drivers that react to the ego and to each other.
         end_us: Last time.
-        signals: Traffic lights, at which all stop.
-        give_way: Lines at which all let others pass.
+        lane_map: Traffic lights at which all stop, and lines at which all let others pass.
         posted_mps: Speed limit at each vertex of the path.
 
     Returns:
         The ego's log (rig poses), and the followers as they drove.
     """
     table = ScriptedTracks(scripts, end_us)
-    expert = _Expert(
-        path, s0_m, vehicle, ego, table,
-        lights_on(path, signals), lights_on(path, give_way), posted_mps,
-    )  # fmt: skip
-    cars = [
-        _Car(follower, lights_on(follower.path, signals), lights_on(follower.path, give_way))
-        for follower in followers
-    ]
+    expert = _Expert(path, s0_m, vehicle, ego, table, *_lines_on(path, lane_map), posted_mps)
+    cars = [_Car(follower, *_lines_on(follower.path, lane_map)) for follower in followers]
     lines = Lines([follower.path for follower in followers]) if cars else None
     log_s = [expert.s]
     for t in range(0, end_us, DECISION_US):
@@ -250,6 +242,16 @@ def drive(
     xyz, yaw = path.at(np.array(log_s)[keep])
     ego_log = Trajectory(t_us[keep], xyz, quat_from_yaw(yaw))
     return ego_log, tuple(car.driven(t_us[:: DECISION_US // LOG_STEP_US]) for car in cars)
+
+
+def _lines_on(
+    path: Path, lane_map: LaneMap | None
+) -> tuple[Sequence[LightAhead], Sequence[LightAhead]]:
+    """Return the lights and the lines to give way at on a path."""
+    if lane_map is None:
+        return (), ()
+    lanes = lane_map.lanes
+    return lights_on(path, lane_map.signals, lanes), lights_on(path, lane_map.give_way, lanes)
 
 
 class _Expert:

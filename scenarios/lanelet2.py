@@ -553,9 +553,7 @@ def _limit_mps(text: str) -> float | None:
 
 
 def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
-    """Return the traffic lights: those of one line are one group, those of lines that lie close
-    together one junction.
-    """
+    """Return the traffic lights: those of lines that lie close together are one junction."""
     held: dict[tuple[str, str], list[str]] = {}  # stop line or else lanelet, and element
     for key in (key for key in lanes if key in osm.lanelets):
         for ref, rule in osm.rules_of(osm.lanelets[key]):
@@ -574,7 +572,7 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
     close = scipy.spatial.distance.cdist(middles, middles) < JUNCTION_M
     _, junction = scipy.sparse.csgraph.connected_components(close)
     return tuple(
-        Head(signal, str(number), line, line)
+        Head(signal, str(number), "", line)
         for (line, signal), number in zip(signals, junction, strict=True)
     )
 

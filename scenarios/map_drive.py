@@ -23,13 +23,14 @@ from scenarios import lanelet2, opendrive
 from scenarios.build import TRACKED_EVERY, with_last
 from scenarios.ego_path import grid
 from scenarios.expert import Follower, drive
+from scenarios.junction_rules import turning_lines
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
 from scenarios.map_route import NARROWEST_M, STATION_M, WIDEST_M, LaneGraph, Spot, Way
 from scenarios.map_traffic import place_followers
 from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
-from scenarios.street_map import CYCLE, GREEN_S, Head, StreetMap, with_cycles
+from scenarios.street_map import CYCLE, Head, StreetMap, with_cycles
 from scenarios.variation import SceneDraft
 
 READERS = {"opendrive": opendrive.read_street, "lanelet2": lanelet2.read_street}
@@ -88,8 +89,7 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         walkers,
         followers,
         _end_us(draft, driven.length_m),
-        lane_map.signals,
-        lane_map.give_way,
+        lane_map,
         graph.limits_mps(way, driven),
     )
     return RecordedLog(
@@ -332,12 +332,10 @@ def _with_signals(
         return any(key in lane_map.lanes for key in signal.lanes)
 
     heads = [head for head in street.heads if is_part(head.signal)]
-    lane_map = replace(
-        lane_map,
-        signals=_timed(heads, line, front_m, cruise_mps),
-        give_way=tuple(signal for signal in street.give_way if is_part(signal)),
-    )
-    return lane_map, heads
+    lights = _timed(heads, line, lane_map, front_m, cruise_mps)
+    signed = (signal for signal in street.give_way if is_part(signal))
+    give_way = (*signed, *turning_lines(lights, lane_map.lanes))
+    return replace(lane_map, signals=lights, give_way=give_way), heads
 
 
 def _inside_bends(line: Path, front_m: float) -> Path:
@@ -352,21 +350,22 @@ def _inside_bends(line: Path, front_m: float) -> Path:
 
 
 def _timed(
-    heads: Sequence[Head], line: Path, front_m: float, cruise_mps: float
+    heads: Sequence[Head], line: Path, lane_map: LaneMap, front_m: float, cruise_mps: float
 ) -> tuple[Signal, ...]:
     """Return the lights with their cycles: the first one on the route turns yellow shortly before
     the ego, on a free road, would pass it.
     """
     signals = [head.signal for head in heads]
-    first = next(iter(lights_on(line, signals)), None)
+    first = next(iter(lights_on(line, signals, lane_map.lanes)), None)
     begins_us: dict[str, int] = {}
     if first is not None:
         number = next(n for n, signal in enumerate(signals) if signal is first.signal)
         head = heads[number]
         timed_signal = with_cycles(heads, {})[number]
-        arrival_s = (first.s_m - front_m) / cruise_mps
-        green_us = round((arrival_s - YELLOW_AHEAD_S - GREEN_S) * 1e6)
-        begins_us[head.junction] = green_us - timed_signal.offset_us
+        arrival_us = round((first.s_m - front_m) / cruise_mps * 1e6)
+        green_us = timed_signal.phases[0][1]
+        turns_green_us = arrival_us - round(YELLOW_AHEAD_S * 1e6) - green_us
+        begins_us[head.junction] = turns_green_us - timed_signal.offset_us
     return with_cycles(heads, begins_us)
 
 

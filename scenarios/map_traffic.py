@@ -16,6 +16,7 @@ from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import LightAhead, lights_on
 from scenarios.expert import Follower
+from scenarios.junction_rules import green_together
 from scenarios.map_route import LaneGraph, Way
 from scenarios.traffic import SIZES
 
@@ -57,8 +58,9 @@ def place_followers(
     graph = LaneGraph(lane_map.lanes)
 
     def ride_on(of_way: Way, path: Path) -> _Ride:
-        lights = lights_on(path, lane_map.signals)
-        return _Ride(of_way, path, lights, lights_on(path, lane_map.give_way))
+        lights = lights_on(path, lane_map.signals, lane_map.lanes)
+        give_way = lights_on(path, lane_map.give_way, lane_map.lanes)
+        return _Ride(of_way, path, lights, give_way)
 
     followers: list[Follower] = []
     rides = [ride_on(way, line)]
@@ -109,14 +111,9 @@ def _is_ruled(ride: _Ride, other: _Ride) -> bool:
         (other, other.path.s[EVERY * row[close].min()]),
     ]
     gives = [_before(meeting.give_way, s_m) is not None for meeting, s_m in meets]
-    lights = [_before(meeting.lights, s_m) for meeting, s_m in meets]
-    first, second = lights
+    first, second = (_before(meeting.lights, s_m) for meeting, s_m in meets)
     if first is not None and second is not None:
-        cycle_us = sum(lasts_us for _, lasts_us in first.signal.phases)
-        return not any(
-            "red" not in (first.signal.colour_at(t_us), second.signal.colour_at(t_us))
-            for t_us in range(0, cycle_us, 500_000)
-        )
+        return sum(gives) == 1 or not green_together(first.signal, second.signal)
     return sum(gives) == 1 and first is None and second is None
 
 

@@ -43,7 +43,7 @@ def place_walkers(
         rng: Which crosswalks, sides, speeds and times.
     """
     stops = [signal.stop.mean(axis=0)[:2] for signal in lane_map.signals or ()]
-    lights = lights_on(driven, lane_map.signals)
+    lights = lights_on(driven, lane_map.signals, lane_map.lanes)
     points = shapely.points(driven.xyz[:, :2])
     places = []
     for ring in lane_map.crosswalks:

@@ -1,5 +1,5 @@
 """What stands on and beside the roads of an OpenDRIVE map: crosswalks, stop lines, signs and traffic
-lights. The lights of one controller (without one: of one road) are one group.
+lights.
 
 Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 """
@@ -30,6 +30,7 @@ PEDESTRIAN_LIGHT = "1000002"
 GIVE_WAY = ("205", "206")  # give way; stop
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
 LOWEST_HEAD_M = 3.0  # of the middle of the lamps above the road, where the map has them lower
+OPEN_ROAD = "on road "  # and its name: of a light whose road leads to no junction
 PLATE_M = 0.1  # what is lower than this is painted on the road
 
 
@@ -83,7 +84,9 @@ def traffic_lights(
     notes on lights that hold back no lane.
 
     A light is waited for at the nearest stop line of its direction, without one beside itself; one
-    that stands on a road inside of a junction, where that road's lanes begin.
+    that stands on a road inside of a junction, where that road's lanes begin. One light before a
+    junction and behind it, for those who leave it, is a post across the junction: it holds those
+    before it.
     """
     heads = []
     loose: dict[str, None] = {}
@@ -93,6 +96,12 @@ def traffic_lights(
             heads += light_heads
             loose |= {} if light_heads else {light.signal_id: None}
     holding = {head.signal.name for head in heads}
+    at_junction = {head.signal.name for head in heads if not head.junction.startswith(OPEN_ROAD)}
+    heads = [
+        head
+        for head in heads
+        if not head.junction.startswith(OPEN_ROAD) or head.signal.name not in at_junction
+    ]
     idle = [name for name in loose if name not in holding]
     notes = [f"{len(idle)} traffic lights hold back no lane: {some_of(idle)}"] if idle else []
     return tuple(heads), tuple(notes)
@@ -124,7 +133,7 @@ def _heads(
     heads = []
     for along in _held_senses(road, light, lanes):
         link = road.successor if along else road.predecessor
-        junction = f"on road {road.road_id}"
+        junction = f"{OPEN_ROAD}{road.road_id}"
         stop_lines = [
             line.s_m
             for line in road.signals
@@ -152,7 +161,7 @@ def _heads(
         place = placed(road, np.array([[light.s_m, light.t_m]]), T_local_map)[0]
         place[2] += max(light.above_m + light.height_m / 2, LOWEST_HEAD_M)
         signal = replace(signal, head=place)
-        group = controllers.get(light.signal_id, f"road {road.road_id}")
+        group = controllers.get(light.signal_id, "")
         heads.append(Head(signal, junction, group, road.road_id))
     return heads
 

@@ -1,33 +1,39 @@
-"""A map without a drive, as its file has it, and the cycle that is assumed for its traffic lights.
+"""A map without a drive, as its file has it, and the program that is assumed for its traffic lights.
 
-Map formats say which lights belong together, and no times. The lights of one group are green
-together, the groups of a junction one after the other, and people cross a road while its own traffic
-has red.
+Map formats have no times. Lights of one phase are green together, the phases of a junction one after
+the other, and people cross a road while its own traffic has red. The phases are those of the map's
+controllers; without any, opposite approaches are green together, with all their turns.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from alpasim_plugin.core.types import Lane, LaneMap, Signal
 from scenarios.map_route import Spot
 
-GREEN_S = 6.0  # of each group
-YELLOW_S = 3.0  # of each group
-CLEAR_S = 2.0  # all are red between two groups
+CYCLE_S = 64.0  # of a junction of two phases ...
+LONGER_S = 12.0  # ... and longer for each further phase
+YELLOW_S = 3.0  # of each phase
+CLEAR_S = 2.0  # all are red between two phases
 WALK_END_S = 5.0  # people have red so long before the traffic may drive
-TURN_S = GREEN_S + YELLOW_S + CLEAR_S
+OPPOSITE_RAD = np.radians(40.0)  # approaches whose axes differ by less are one phase ...
+CROSSING_RAD = np.radians(60.0)  # ... and by more cross each other
 CYCLE = (
-    f"assumed {GREEN_S:g} s green, {YELLOW_S:g} s yellow, {CLEAR_S:g} s red for all, groups in turn"
+    f"assumed cycles of {CYCLE_S:g} s for two phases and {LONGER_S:g} s more for each further one, "
+    f"{YELLOW_S:g} s yellow and {CLEAR_S:g} s red for all among them; phases are the map's "
+    "controllers, without any the opposite approaches together"
 )
 
 
 @dataclass(frozen=True)
 class Head:
-    """A traffic light, where one waits for it, and the group that it belongs to."""
+    """A traffic light, where one waits for it, and what switches it."""
 
     signal: Signal  # without its cycle
     junction: str
-    group: str
+    group: str  # the map's controller; empty: none
     road_id: str
 
 
@@ -61,30 +67,97 @@ def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Si
 
     Args:
         heads: All lights.
-        begins_us: Junction to the time at which its first group turns green; others begin at 0.
+        begins_us: Junction to the time at which its first phase turns green; others begin at 0.
     """
-    groups: dict[str, list[str]] = {}
-    of_road: dict[str, str] = {}
+    junctions: dict[str, list[Head]] = {}
     for head in heads:
-        junction_groups = groups.setdefault(head.junction, [])
-        if not head.signal.pedestrians:
-            junction_groups.append(head.group)
-            of_road[head.road_id] = head.group
-    out = []
-    for head in heads:
-        junction_groups = sorted(set(groups[head.junction]), key=lambda name: (len(name), name))
-        group = of_road.get(head.road_id, head.group)
-        turn = junction_groups.index(group) if group in junction_groups else 0
-        cycle_s = TURN_S * max(len(junction_groups), 2)
-        if head.signal.pedestrians:
-            walk_s = cycle_s - TURN_S - WALK_END_S
-            phases = [("green", walk_s), ("red", cycle_s - walk_s)]
-            first_s = TURN_S
+        junctions.setdefault(head.junction, []).append(head)
+    programs = {junction: _Program(members) for junction, members in junctions.items()}
+    return tuple(
+        programs[head.junction].timed(head, begins_us.get(head.junction, 0)) for head in heads
+    )
+
+
+class _Program:
+    """Phases of the lights of one junction, at least two: for a light alone the other is empty."""
+
+    def __init__(self, heads: Sequence[Head]) -> None:
+        self._vehicles = [head for head in heads if not head.signal.pedestrians]
+        names = sorted({head.group for head in self._vehicles}, key=lambda name: (len(name), name))
+        by_controller = [
+            [head for head in self._vehicles if head.group == name] for name in names if name
+        ]
+        if len(names) < 2 or "" in names or any(_cross(members) for members in by_controller):
+            self._phases = _by_axis(self._vehicles)
         else:
-            rest_s = cycle_s - GREEN_S - YELLOW_S
-            phases = [("green", GREEN_S), ("yellow", YELLOW_S), ("red", rest_s)]
-            first_s = 0.0
-        offset_us = begins_us.get(head.junction, 0) + round((turn * TURN_S + first_s) * 1e6)
-        timed = tuple((colour, round(lasts_s * 1e6)) for colour, lasts_s in phases)
-        out.append(replace(head.signal, phases=timed, offset_us=offset_us))
-    return tuple(out)
+            self._phases = by_controller
+        self._n_phases = max(len(self._phases), 2)
+
+    @property
+    def cycle_s(self) -> float:
+        """Return the length of the cycle."""
+        return CYCLE_S + LONGER_S * (self._n_phases - 2)
+
+    def timed(self, head: Head, begin_us: int) -> Signal:
+        """Return a light with its cycle."""
+        phase_s = self.cycle_s / self._n_phases
+        first_s = phase_s * self._phase(head)
+        if head.signal.pedestrians:
+            walk_s = self.cycle_s - phase_s - WALK_END_S
+            colours = [("green", walk_s), ("red", self.cycle_s - walk_s)]
+            first_s += phase_s
+        else:
+            green_s = phase_s - YELLOW_S - CLEAR_S
+            red_s = self.cycle_s - green_s - YELLOW_S
+            colours = [("green", green_s), ("yellow", YELLOW_S), ("red", red_s)]
+        phases = tuple((colour, round(lasts_s * 1e6)) for colour, lasts_s in colours)
+        return replace(head.signal, phases=phases, offset_us=begin_us + round(first_s * 1e6))
+
+    def _phase(self, head: Head) -> int:
+        """Return the number of the phase of a light; of one for people that of the traffic that they
+        cross.
+        """
+        if not head.signal.pedestrians:
+            return next(
+                number
+                for number, phase in enumerate(self._phases)
+                if any(member is head for member in phase)
+            )
+        crossed_rad = head.signal.heading_rad + np.pi / 2
+        candidates = [other for other in self._vehicles if other.road_id == head.road_id]
+        nearest = min(
+            candidates or self._vehicles,
+            key=lambda other: _between_axes(other.signal.heading_rad, crossed_rad),
+            default=None,
+        )
+        return 0 if nearest is None else self._phase(nearest)
+
+
+def _by_axis(heads: Sequence[Head]) -> list[list[Head]]:
+    """Return lights by the axes of their approaches, along which traffic comes from both ends."""
+    phases: list[list[Head]] = []
+    for head in heads:
+        apart_rad = [
+            _between_axes(phase[0].signal.heading_rad, head.signal.heading_rad) for phase in phases
+        ]
+        nearest = int(np.argmin(apart_rad)) if apart_rad else 0
+        if apart_rad and apart_rad[nearest] < OPPOSITE_RAD:
+            phases[nearest].append(head)
+        else:
+            phases.append([head])
+    return phases
+
+
+def _cross(heads: Sequence[Head]) -> bool:
+    """Return whether the traffic of some of these lights crosses that of others."""
+    headings_rad = [head.signal.heading_rad for head in heads]
+    return any(
+        _between_axes(first, second) > CROSSING_RAD
+        for first in headings_rad
+        for second in headings_rad
+    )
+
+
+def _between_axes(first_rad: float, second_rad: float) -> float:
+    """Return the angle between two lines, 0 to pi / 2."""
+    return float(np.arcsin(min(abs(np.sin(first_rad - second_rad)), 1.0)))

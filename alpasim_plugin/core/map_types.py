@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 F64 = npt.NDArray[np.float64]
 LEVEL_M = 3.0  # a stop line farther above or below belongs to another road
+MOST_TURNED = (
+    0.5  # cosine between a drive and the traffic that a light holds: who crosses is not held
+)
 
 LaneMarkType = Literal[
     "none",
@@ -88,8 +91,8 @@ class Signal:
         raise AssertionError("a time of a cycle is in one of its phases")
 
     def crossings(self, line: F64, origin: F64) -> list[tuple[int, float]]:
-        """Return where a line ``(N, 3)`` passes the stop line in the direction of its traffic: the
-        vertex before, and the share of the way to the next one.
+        """Return where a line ``(N, 3)`` passes the stop line in the direction of its traffic, to
+        `MOST_TURNED`: the vertex before, and the share of the way to the next one.
 
         Args:
             line: Metres, relative to ``origin``.
@@ -98,13 +101,17 @@ class Signal:
         start = self.stop[0] - origin
         along = self.stop[1, :2] - self.stop[0, :2]
         normal = np.array([-along[1], along[0]])
-        normal *= np.sign(normal @ (np.cos(self.heading_rad), np.sin(self.heading_rad)))
+        direction = np.array([np.cos(self.heading_rad), np.sin(self.heading_rad)])
+        normal *= np.sign(normal @ direction)
         beyond = (line[:, :2] - start[:2]) @ normal
         crossings = []
         for k in np.flatnonzero((beyond[:-1] < 0.0) & (beyond[1:] >= 0.0)).tolist():
             share = float(beyond[k] / (beyond[k] - beyond[k + 1]))
-            projection = (line[k, :2] + share * (line[k + 1, :2] - line[k, :2]) - start[:2]) @ along
-            if 0.0 <= projection <= along @ along and abs(line[k, 2] - start[2]) <= LEVEL_M:
+            step = line[k + 1, :2] - line[k, :2]
+            projection = (line[k, :2] + share * step - start[:2]) @ along
+            runs_along = step @ direction >= MOST_TURNED * np.hypot(*step)
+            on_level = abs(line[k, 2] - start[2]) <= LEVEL_M
+            if 0.0 <= projection <= along @ along and runs_along and on_level:
                 crossings.append((k, share))
         return crossings
 

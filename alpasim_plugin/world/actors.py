@@ -344,8 +344,8 @@ class _Driver:
         self.give_way: tuple[LightAhead, ...] = ()
         self.wanted_mps: F64 | None = None
         if self.path is not None and lane_map is not None:
-            self.lights = lights_on(self.path, lane_map.signals)
-            self.give_way = lights_on(self.path, lane_map.give_way)
+            self.lights = lights_on(self.path, lane_map.signals, lane_map.lanes)
+            self.give_way = lights_on(self.path, lane_map.give_way, lane_map.lanes)
             self.wanted_mps = bend_speeds(self.path, self.params)
         self.line = -1
         self.motion: _Motion | None = None

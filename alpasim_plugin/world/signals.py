@@ -2,21 +2,23 @@
 one that is red, or at which others come.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.types import Signal
+from alpasim_plugin.core.lights_passed import passings
+from alpasim_plugin.core.types import Lane, Signal
 from alpasim_plugin.world.idm import Bodies
 from alpasim_plugin.world.path import Path
 
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
 SEEN_M = 30.0  # others are looked for from so far before a line to give way at
-CROSSED_M = 20.0  # behind the line
+CROSSED_M = 30.0  # behind the line
 CROSSED_S = np.arange(0.0, 4.1, 0.5)  # ahead in time
 LATERAL_M = 2.5  # who comes nearer to the own way is let pass
 MOVING_MPS = 0.5
+ALONG = 0.7  # cosine between the own way and those who drive along it ahead, who are followed
 
 
 @dataclass(frozen=True)
@@ -27,15 +29,20 @@ class LightAhead:
     signal: Signal
 
 
-def lights_on(path: Path, signals: Sequence[Signal] | None) -> tuple[LightAhead, ...]:
-    """Return the lights for vehicles whose lines a path passes in their direction, in its order."""
-    lights = []
-    for signal in signals or ():
-        if signal.pedestrians:
-            continue
-        for k, share in signal.crossings(path.xyz, np.zeros(3)):
-            s_m = path.s[k] + share * (path.s[k + 1] - path.s[k])
-            lights.append(LightAhead(float(s_m), signal))
+def lights_on(
+    path: Path, signals: Sequence[Signal] | None, lanes: Mapping[str, Lane]
+) -> tuple[LightAhead, ...]:
+    """Return the lights for vehicles that hold the lanes which a path follows, in its order.
+
+    Args:
+        path: Where somebody drives.
+        signals: Lights, or lines to give way at.
+        lanes: The map's lanes.
+    """
+    lights = [
+        LightAhead(passing.s_m, passing.signal)
+        for passing in passings(path.xyz, signals or (), lanes, np.zeros(3))
+    ]
     return tuple(sorted(lights, key=lambda light: light.s_m))
 
 
@@ -62,8 +69,8 @@ def give_way_gap_m(
     """Return the distance from the front bumper to the nearest line at which others are to be let
     pass; infinite without one.
 
-    Others come if, at the speed that they have, they will be on the way behind the line. Who follows
-    on the own way before the line does not count.
+    Others come if, at the speed that they have, they will be on the way behind the line. Who drives
+    along the own way, before the line or behind it, does not count.
 
     Args:
         lines: On the path, in its order.
@@ -78,7 +85,8 @@ def give_way_gap_m(
             continue
         crossed, _ = path.at(np.arange(line.s_m + 1.0, line.s_m + CROSSED_M, 1.0))
         s_m, offset_m = path.project(bodies.xy)
-        counts = (s_m > line.s_m) | (np.abs(offset_m) > LATERAL_M)
+        turned_rad = bodies.yaw - path.at(s_m)[1]
+        counts = (np.cos(turned_rad) < ALONG) | (np.abs(offset_m) > LATERAL_M)
         counts &= np.linalg.norm(bodies.velocity, axis=1) > MOVING_MPS
         counts &= np.arange(len(bodies.xy)) != row
         ahead = bodies.velocity[counts, None] * CROSSED_S[:, None]

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
+from alpasim_plugin.core.lights_passed import passed_red, passings
 from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Scene, Trajectory
 from evaluators.metrics import nuplan
 from evaluators.metrics.footprint import Footprints, origin_of
@@ -33,6 +34,7 @@ class ScoredRollout:
     ) -> None:
         origin = origin_of(scene.ego_log, preset)
         self.ego, self.tracks = states_of(rollout, preset, centre, origin)
+        self._lanes_by_id = scene.lane_map.lanes
         self._lanes = list(scene.lane_map.lanes.values())
         self._xyz = centre.xyz - origin
         self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
@@ -135,8 +137,8 @@ class ScoredRollout:
 
     @cached_property
     def ran_red(self) -> Bool | None:
-        """Where ``(T,)`` the middle of the ego's front passes the line of a traffic light that is
-        red; None where no states are known.
+        """Where ``(T,)`` the middle of the ego's front passes the line of a red traffic light of the
+        lane that it follows; None where no states are known.
         """
         if self._signals is None:
             return None
@@ -144,10 +146,13 @@ class ScoredRollout:
         t_us = self.ego.t_us
         out = np.zeros(len(t_us), dtype=np.bool_)
         line = np.column_stack([front, self._xyz[:, 2]])
-        for signal in (one for one in self._signals if not one.pedestrians):
-            for k, share in signal.crossings(line, self._origin):
-                passed_us = round(float(t_us[k] + share * (t_us[k + 1] - t_us[k])))
-                out[k + 1] |= signal.colour_at(passed_us) in RED
+        at_lines = passings(line, self._signals, self._lanes_by_id, self._origin)
+        are_red = []
+        for passing in at_lines:
+            step_us = t_us[passing.vertex + 1] - t_us[passing.vertex]
+            passed_us = round(float(t_us[passing.vertex] + passing.share * step_us))
+            are_red.append(passing.signal.colour_at(passed_us) in RED)
+        out[[passing.vertex + 1 for passing in passed_red(at_lines, are_red)]] = True
         return out
 
     def traffic_lights(self) -> Part:

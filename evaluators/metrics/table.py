@@ -473,7 +473,7 @@ METRICS = MetricTable(
             label="red light",
             reference=FOOTPRINT,
             invalid="no states are known",
-            formula="the middle of the front of `F` passes a stop line in the direction of its lane while its light is red, or red and yellow",
+            formula="the middle of the front of `F` passes a stop line in the direction of its lane while the light of the lane that it follows is red, or red and yellow",
         ),
         "dist_to_gt_location": _metres(
             "distance of the ego centre from where the recording is at that time",

@@ -149,11 +149,13 @@ def test_lights_of_a_junction_take_turns_and_people_walk_while_their_road_has_re
     crossing = (
         '<signal id="z" s="95" t="-3.5" type="1000003" dynamic="no" orientation="+" width="8"/>'
     )
+    northward = '<geometry s="0" x="110" y="-110" hdg="1.5708" length="100"><line/></geometry>'
     parts = (
         with_signals(incoming, light("a", 98, validity), light("p", 95, kind="1000002"), crossing),
         with_signals(inside, '<signalReference id="a" s="12" t="-5" orientation="+"/>'),
         with_signals(
-            road("3", section(0, lane(-1)), x=400, length=100, after="junction:9"), light("b", 98)
+            road("3", section(0, lane(-1)), length=100, after="junction:9", view=northward),
+            light("b", 98),
         ),
         junction_of('<controller id="n"><control signalId="b"/></controller>'),
     )

@@ -18,7 +18,7 @@ BOX = Box(4.6, 1.85, 1.5)
 def gap(x, y, speed_mps, heading, own=-1, front=30.0):
     along = np.array([np.cos(heading), np.sin(heading)])
     bodies = bodies_from(np.array([x, y]), np.array([heading]), [BOX], speed_mps * along)
-    return give_way_gap_m(lights_on(NORTH, [LINE]), NORTH, front, bodies, own)
+    return give_way_gap_m(lights_on(NORTH, [LINE], {}), NORTH, front, bodies, own)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_a_driver_slows_down_before_a_bend_and_creeps_around_a_corner():
 
 def test_a_yellow_light_is_one_to_stop_at_where_the_brake_is_enough_for_it():
     crossing = replace(LINE, phases=(("yellow", 3_000_000), ("red", 3_000_000)))
-    lights = lights_on(NORTH, [crossing])  # the line is 44 m along the path
+    lights = lights_on(NORTH, [crossing], {})  # the line is 44 m along the path
     speed_mps = 12.0  # stops within 12^2 / (2 * 3) = 24 m
     for gap_m, stops in ((23.9, False), (24.1, True), (40.0, True)):
         met = red_gap_m(lights, 44.0 - gap_m, speed_mps, 1_000_000)
