@@ -24,7 +24,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.log.images import encode_image
-from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, health_pb2, reflection_pb2
+from alpasim_plugin.log.wire import (
+    common_pb2,
+    egodriver_pb2,
+    health_pb2,
+    reflection_pb2,
+    sensorsim_pb2,
+)
 from alpasim_plugin.log.wire.services import Stub, methods
 from tests.alpasim.service_cases import (
     START_US,
@@ -175,6 +181,55 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
         for call in calls:
             assert failure(lambda call=call: next(call))[0] is Code.CANCELLED
         silence.over.set()
+
+
+class LargeImages:
+    """A renderer whose images are 8 MiB."""
+
+    def get_version(self, request, context):
+        return common_pb2.VersionId(version_id="large")
+
+    def render_rgb(self, request, context):
+        return sensorsim_pb2.RGBRenderReturn(image_bytes=bytes(8 << 20))
+
+
+@pytest.mark.parametrize(
+    ("budget_mb", "reading_s", "left_mb"), [(36, 600.0, 32), (1000, 0.5, 0)], ids=["full", "late"]
+)
+def test_answers_that_callers_do_not_take_are_bounded_and_hold_nobody_up(
+    monkeypatch, budget_mb, reading_s, left_mb
+):
+    monkeypatch.setattr(hosting, "UNREAD_BYTES", budget_mb << 20)
+    monkeypatch.setattr(hosting, "READING_S", reading_s)
+    monkeypatch.setattr(hosting, "UPKEEP_S", 0.1)
+    answers = []
+    enter = hosting.Unread.enter
+
+    def watched(unread, context, size):
+        enter(unread, context, size)
+        answers.append(unread)
+
+    monkeypatch.setattr(hosting.Unread, "enter", watched)
+    name = "SensorsimService"
+    wanted = sensorsim_pb2.RGBRenderRequest()
+    options = [("grpc.http2.bdp_probe", 0)]  # which would let whole answers come unasked
+    with (
+        hosted({name: LargeImages()}, workers=2) as host,
+        grpc.insecure_channel(host.address, options) as channel,
+    ):
+        # the caller of a stream takes no answer before it asks for it
+        ask = channel.stream_stream(methods(name)["render_rgb"].path)
+        calls = [ask(iter([wanted.SerializeToString()])) for _ in range(12)]
+        until_s = time.monotonic() + 60
+        while len(answers) < len(calls) or answers[0].held >> 20 != left_mb:
+            assert time.monotonic() < until_s, [one.held for one in answers]
+            time.sleep(0.02)
+        assert is_served(host, name)
+        with channel_to(host) as other:
+            image = Stub(other, name).render_rgb(wanted, timeout=20).image_bytes
+        assert len(image) == 8 << 20
+        for call in calls:
+            call.cancel()
 
 
 @pytest.mark.parametrize("name", SERVICES)

@@ -34,6 +34,8 @@ LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 RECEIVING = 128  # calls whose message is in memory and that are not worked on yet
 SENDING_S = 30.0  # a caller that has not sent its message after so long is cancelled
+UNREAD_BYTES = 512 << 20  # of all answers that callers have not taken yet
+READING_S = 30.0  # a caller that has not taken its answer after so long is cancelled
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
 HANDSHAKE_S = 20.0  # from the connection to the end of the handshakes of TLS and HTTP/2
 SESSIONS = 64  # sessions at a time
@@ -286,6 +288,64 @@ class Health:
         return response(status=response.SERVING if self.is_serving else response.NOT_SERVING)
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """An answer that its caller has not taken yet.
+
+    Attributes:
+        since_s: When it was made.
+        size: Its bytes.
+    """
+
+    since_s: float
+    size: int
+
+
+class Unread:
+    """Answers that their callers have not taken yet, which stay in memory: no more bytes than
+    `UNREAD_BYTES`, and none for longer than `READING_S`.
+    """
+
+    def __init__(self) -> None:
+        self._answers: dict[Any, _Answer] = {}  # by the context of the call, the oldest first
+        self._lock = threading.Lock()
+
+    @property
+    def held(self) -> int:
+        """Give the bytes of all of them."""
+        with self._lock:
+            return sum(answer.size for answer in self._answers.values())
+
+    def enter(self, context: Any, size: int) -> None:
+        """Enter an answer until its call ends. Where all together are too many bytes, the calls
+        whose answers have waited for longest are cancelled.
+        """
+        with self._lock:
+            self._answers[context] = _Answer(time.monotonic(), size)
+            over = sum(answer.size for answer in self._answers.values()) - UNREAD_BYTES
+            crowded = []
+            for other, answer in self._answers.items():
+                if over > 0 and other is not context:
+                    over -= answer.size
+                    crowded.append(other)
+        if not context.add_callback(partial(self._leave, context)):
+            self._leave(context)  # it has ended already
+        for other in crowded:
+            other.cancel()
+
+    def cancel_slow(self) -> None:
+        """Cancel the calls whose answers wait for too long."""
+        latest_s = time.monotonic() - READING_S
+        with self._lock:
+            slow = [call for call, answer in self._answers.items() if answer.since_s < latest_s]
+        for context in slow:
+            context.cancel()
+
+    def _leave(self, context: Any) -> None:
+        with self._lock:
+            self._answers.pop(context, None)
+
+
 class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
     """Check the token of every call, and limit how many messages are in memory and how many calls
     are worked on at the same time. A message stays with its caller until there is a place for it.
@@ -300,6 +360,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         self._working = threading.Semaphore(workers)
         self._receiving = threading.Semaphore(RECEIVING)
         self._senders: dict[Any, float] = {}  # context of a call -> since when it sends
+        self._unread = Unread()
         # A handler of a stream starts before the message has come: a refused call holds no thread.
         self._refusal = grpc.stream_unary_rpc_method_handler(unauthenticated)
 
@@ -318,12 +379,13 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
             handler.response_serializer,
         )
 
-    def cancel_slow_senders(self) -> None:
-        """Cancel the calls that have not sent their message in time."""
+    def cancel_slow(self) -> None:
+        """Cancel the calls that have not sent their message, or taken their answer, in time."""
         latest_s = time.monotonic() - SENDING_S
         for context, since_s in list(self._senders.items()):
             if since_s < latest_s:
                 context.cancel()
+        self._unread.cancel_slow()
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -339,7 +401,9 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
                 with left.holding(self._receiving):
                     request = self._received(messages, context)
                     place.enter_context(left.holding(self._working))
-                return call(request, context)
+                answer = call(request, context)
+                self._unread.enter(context, answer.ByteSize())
+                return answer
         except Late as late:
             context.abort(grpc.StatusCode.CANCELLED, str(late))
 
@@ -458,5 +522,5 @@ class Host:
 
     def _repeat(self) -> None:
         while not self._ended.wait(UPKEEP_S):
-            self._gate.cancel_slow_senders()
+            self._gate.cancel_slow()
             self._on_interval()
