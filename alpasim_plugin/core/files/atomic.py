@@ -284,7 +284,7 @@ def write_array(path: Path, array: npt.NDArray[Any]) -> None:
 def write_safetensors(
     path: Path | str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write tensors as safetensors atomically; see `atomic_file`."""
+    """Write tensors as safetensors atomically; see `atomic_file`. Equal content gives equal bytes."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
@@ -297,3 +297,22 @@ def write_safetensors(
             )
         except SafetensorError as error:  # a refused write, among others
             raise OSError(errno.EIO, str(error)) from error
+        if metadata:
+            _sort_metadata(partial)
+
+
+def _sort_metadata(path: Path) -> None:
+    """Put the metadata of a safetensors file in the order of their names; the library has them in
+    another order in every process.
+
+    The file begins with the length of its header in eight bytes, then comes the header as JSON.
+    """
+    with path.open("r+b") as file:
+        length = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(length))
+        metadata = dict(sorted(header.pop("__metadata__").items()))
+        text = json.dumps(
+            {"__metadata__": metadata, **header}, separators=(",", ":"), ensure_ascii=False
+        )
+        file.seek(8)
+        file.write(text.encode().ljust(length))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
@@ -70,6 +71,21 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert json.loads((tmp_path / "json").read_text()) == {"n": 3}
     np.testing.assert_array_equal(np.load(tmp_path / "array"), [3, 3, 3, 3])
     assert load_file(tmp_path / "safetensors")["n"].tolist() == [3, 3, 3, 3]
+
+
+def test_safetensors_of_equal_content_have_equal_bytes_in_every_process(tmp_path):
+    code = (
+        "import sys, torch\n"
+        "from alpasim_plugin.core.files.atomic import write_safetensors\n"
+        "facts = {name: f'é \\x01\\x7f\\n\"{name}' for name in 'qwertyuiop'}\n"
+        "write_safetensors(sys.argv[1], {'b': torch.ones(3), 'a': torch.zeros(2)}, facts)\n"
+    )
+    for name in "ab":
+        subprocess.run([sys.executable, "-c", code, str(tmp_path / name)], check=True)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    with safe_open(tmp_path / "a", "pt") as file:
+        assert file.metadata() == {name: f'é \x01\x7f\n"{name}' for name in "qwertyuiop"}
+        assert file.get_tensor("b").tolist() == [1.0, 1.0, 1.0]
 
 
 def test_a_process_killed_in_the_middle_leaves_the_old_file(tmp_path):
