@@ -36,7 +36,7 @@ from alpasim_plugin.core.types import (
     Trajectory,
 )
 from alpasim_plugin.log.run_folder.manifests import read_run_json, write_manifest
-from alpasim_plugin.log.run_folder.records import Fork
+from alpasim_plugin.log.run_folder.records import Fork, Manifest
 from alpasim_plugin.log.run_folder.schema import MANIFEST, RUN_INFO
 from alpasim_plugin.log.run_folder.writer import writing
 from alpasim_plugin.log.trace import first_difference
@@ -47,7 +47,7 @@ from alpasim_plugin.runs.cell import (
     run_cell,
     users_parts,
 )
-from alpasim_plugin.runs.execute import thread_budget
+from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.guards import calling
 from alpasim_plugin.runs.local_executor import apart
 from alpasim_plugin.runs.logged_rollout import LoggedRollout
@@ -358,30 +358,77 @@ def fork_rollout(
 def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str]) -> RunResult:
     began = time.perf_counter()
     options = replace(past.options, baseline=past.cell.renderer.name)
+    threads = thread_budget(1, 1)
+    original = _copied_original(past, root)
     then = change.apply(past.cell, options)
-    # Copy the original rollout's folder and return its manifest.
+    fork = _fork_cell(past.cell, then, change, options)
+    continuation = _driven(past, then, change, fork, options, root, threads)
+    if continuation.ok:
+        _check_replay(past, past.scenario.start_us + change.after_us, root / fork.folder)
+        continuation = replace(
+            continuation, fork=Fork(**vars(change), of=past.name, replay="equal")
+        )
+        write_manifest(root / fork.folder, continuation)
+    plan = RunPlan(
+        cells=(past.cell, fork),
+        scenarios={past.cell.scene: past.scenario},
+        renderers=(past.cell.renderer, fork.renderer),
+        policies=(past.cell.policy,),
+        seeds=(past.cell.seed,),
+        options=options,
+    )
+    write_run_info(root, plan, command, threads)
+    manifests = [original, continuation]
+    info = replace(
+        read_run_json(root),
+        kind="fork",
+        fork=continuation.fork,
+        pool=pool_of(manifests, threads, time.perf_counter() - began, None),
+    )
+    summary = finish_run(root, info, manifests)
+    return RunResult(root, summary, 2, summary.failures.n_failed)
+
+
+def _copied_original(past: LoggedRollout, root: Path) -> Manifest:
+    """Copy the folder of the logged rollout into the run and return its manifest there."""
     folder = root / past.cell.folder
     shutil.copytree(past.folder, folder, dirs_exist_ok=True)
-    original = replace(past.manifest, path=past.cell.folder.as_posix(), reused=True)
-    write_manifest(folder, original)
+    manifest = replace(past.manifest, path=past.cell.folder.as_posix(), reused=True)
+    write_manifest(folder, manifest)
+    return manifest
+
+
+def _fork_cell(original: Cell, then: Cell, change: Change, options: RunOptions) -> Cell:
+    """Return the continuation's place in the tables: the original's, but for a renderer that is
+    named after the change, and keys of its own.
+    """
     key = digest(
         [
-            past.cell.rollout_key,
+            original.rollout_key,
             asdict(change),
             then.renderer.digest,
             then.policy.digest,
             then.controller.digest,
         ]
     )
-    label = replace(then.renderer, name=change.label)
-    fork = replace(
-        past.cell,
-        renderer=label,
+    return replace(
+        original,
+        renderer=replace(then.renderer, name=change.label),
         rollout_key=key,
-        score_key=score_key(key, options.preset, past.cell.evaluators),
+        score_key=score_key(key, options.preset, original.evaluators),
     )
-    threads = thread_budget(1, 1)
-    at_us = past.scenario.start_us + change.after_us
+
+
+def _driven(
+    past: LoggedRollout,
+    then: Cell,
+    change: Change,
+    fork: Cell,
+    options: RunOptions,
+    root: Path,
+    threads: Threads,
+) -> Manifest:
+    """Drive the continuation and return its manifest, which holds the error where it failed."""
     work = partial(
         run_cell,
         options=options,
@@ -391,33 +438,11 @@ def _fork(past: LoggedRollout, change: Change, root: Path, command: Sequence[str
     )
     parts = users_parts(past.cell) or users_parts(then)
     try:
-        manifest = apart(work, fork, parts, threads.per_worker)
+        return apart(work, fork, parts, threads.per_worker)
     except SimrunError as error:
         manifest = failed_manifest(fork, error)
         write_manifest(root / fork.folder, manifest)
-    if manifest.ok:
-        _check_replay(past, at_us, root / fork.folder)
-        manifest = replace(manifest, fork=Fork(**vars(change), of=past.name, replay="equal"))
-        write_manifest(root / fork.folder, manifest)
-    cells = (past.cell, fork)
-    renderers = (past.cell.renderer, fork.renderer)
-    plan = RunPlan(
-        cells,
-        {past.cell.scene: past.scenario},
-        renderers,
-        (past.cell.policy,),
-        (past.cell.seed,),
-        options,
-    )
-    write_run_info(root, plan, command, threads)
-    info = replace(
-        read_run_json(root),
-        kind="fork",
-        fork=manifest.fork,
-        pool=pool_of([original, manifest], threads, time.perf_counter() - began, None),
-    )
-    summary = finish_run(root, info, [original, manifest])
-    return RunResult(root, summary, 2, summary.failures.n_failed)
+        return manifest
 
 
 def _parts(
