@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ from alpasim_plugin.cli.options import Evaluators, Json
 from alpasim_plugin.cli.output import Progress, first_screen, report_lines, show, warn
 from alpasim_plugin.core.errors import InputError, error_lines
 from alpasim_plugin.core.flags import Flag, Positional
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.runs.score import ScoreResult, execute_score
 from alpasim_plugin.runs.score_logs import KnownScenes, find_logs
@@ -64,47 +66,70 @@ def score(
     unpickled.
     """
     chosen = {name: find_preset(name) for name in map(str.strip, preset.split(","))}
-    is_alone = len(chosen) == 1
-    own_settings = {
-        name: _settings(choice, settings if is_alone or choice.aliases else None)
-        for name, choice in chosen.items()
-    }
+    jobs = [_job(choice, settings, out, len(chosen) == 1) for choice in chosen.values()]
     paths = find_logs(logs)
     parts = resolve_evaluators(evaluators)
     results: dict[str, ScoreResult] = {}
-    odd: dict[str, None] = {}  # what is odd about logs, each line once
+    oddities: dict[str, None] = {}  # what is odd about logs, each line once
     with Progress(as_json) as progress:
 
         def done(manifest: Manifest) -> None:
             progress.rollout_done(manifest, reused=False)
-            odd.update(dict.fromkeys(manifest.warnings or ()))
+            oddities.update(dict.fromkeys(manifest.warnings or ()))
 
-        for name, choice in chosen.items():
-            preset_settings = own_settings[name]
+        for name, job in zip(chosen, jobs, strict=True):
             progress.add_task(name, total=len(paths))
             results[name] = execute_score(
                 paths,
                 KnownScenes(scene),
-                choice if preset_settings is None else preset_settings.preset(choice),
-                preset_settings,
+                job.preset,
+                job.settings,
                 parts,
-                out if out is None or is_alone else out / name,
+                job.out,
                 ["simrun", *sys.argv[1:]],
                 done,
                 progress.noticed,
             )
     code = worst_code([result.exit_code for result in results.values()])
-    documents = {name: result.as_dict() for name, result in results.items()}
-    facts = {"exit_code": code, "presets": documents}
-    if is_alone:
-        (facts,) = documents.values()
     if not as_json:
-        _warn_of_odd_logs(tuple(odd))
+        _warn_of_odd_logs(tuple(oddities))
         for result in results.values():
             _warn_of_failures(result.summary)
     has_protocol = any(choice.protocol for choice in chosen.values())
-    show(as_json, facts, *_result_lines(results, has_protocol))
+    show(as_json, _json_of(results, code), *_result_lines(results, has_protocol))
     raise typer.Exit(code)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What one of the named presets scores with, and into which run folder."""
+
+    preset: presets.Preset
+    settings: EvalSettings | None
+    out: Path | None
+
+
+def _job(
+    choice: presets.Preset, settings_file: Path | None, out: Path | None, is_alone: bool
+) -> _Job:
+    """Return the job of a preset. Beside others it has a folder of its own in ``out``, and the
+    settings are only for a preset that has AlpaSim's names of metrics.
+    """
+    settings = _settings(choice, settings_file if is_alone or choice.aliases else None)
+    return _Job(
+        preset=choice if settings is None else settings.preset(choice),
+        settings=settings,
+        out=out if out is None or is_alone else out / choice.name,
+    )
+
+
+def _json_of(results: Mapping[str, ScoreResult], code: int) -> JsonObject:
+    """Return the results for JSON: of a single preset its own, of several each by name."""
+    documents = {name: result.as_dict() for name, result in results.items()}
+    if len(documents) == 1:
+        (document,) = documents.values()
+        return document
+    return {"exit_code": code, "presets": documents}
 
 
 def _result_lines(results: Mapping[str, ScoreResult], has_protocol: bool) -> list[Any]:

@@ -100,13 +100,7 @@ def execute_score(
         InfrastructureError: Another process writes the folder.
     """
     began = time.perf_counter()
-    facts = {
-        "logs": sorted(file_sha256(log) for log in logs),
-        "scenes": scenes.places,
-        "preset": preset.as_dict(),
-        "evaluators": sorted(part.name for part in evaluators),
-    }
-    key = digest(facts)[:12]
+    key = _key(logs, scenes, preset, evaluators)
     root = root or Path("runs", f"score-{slug(real(logs[0]).parent.parent.name)}-{key}")
     with writing(root):
         earlier = _earlier_results(root, key)
@@ -115,10 +109,7 @@ def execute_score(
             noticed(f"scored again: {some_of(changes)}")
         unfinish(root)
         scores = score_logs(logs, scenes, preset, evaluators, root, on_done)
-        aggregation: JsonObject | None = None
-        error: EvaluatorError | None = None
-        if settings is not None:
-            aggregation, error = _aggregate(scores, preset, settings, root / AGGREGATE)
+        aggregation, error = _aggregate(scores, preset, settings, root / AGGREGATE)
         manifests = [log_score.manifest for log_score in scores]
         for manifest in manifests:
             write_manifest(root / manifest.path, manifest)
@@ -131,6 +122,19 @@ def execute_score(
         info = replace(info, alpasim=aggregation, pool=pool, exit_code=code)
         summary = finish_run(root, info, manifests)
     return ScoreResult(root, summary, code)
+
+
+def _key(
+    logs: Sequence[Path], scenes: KnownScenes, preset: Preset, evaluators: Sequence[PartSpec]
+) -> str:
+    """Return what names the results: logs by content, scenes, preset and evaluators by name."""
+    facts = {
+        "logs": sorted(file_sha256(log) for log in logs),
+        "scenes": scenes.places,
+        "preset": preset.as_dict(),
+        "evaluators": sorted(part.name for part in evaluators),
+    }
+    return digest(facts)[:12]
 
 
 def _earlier_results(root: Path, key: str) -> RunInfo | None:
@@ -153,12 +157,15 @@ def _earlier_results(root: Path, key: str) -> RunInfo | None:
 
 
 def _aggregate(
-    scores: Sequence[LogScore], preset: Preset, settings: EvalSettings, folder: Path
-) -> tuple[JsonObject, EvaluatorError | None]:
-    """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files.
+    scores: Sequence[LogScore], preset: Preset, settings: EvalSettings | None, folder: Path
+) -> tuple[JsonObject | None, EvaluatorError | None]:
+    """Aggregate as AlpaSim does, put its rollout values into the manifests, and write its files;
+    without settings there is nothing to aggregate.
 
     An error of the scene score leaves the values of the rollouts.
     """
+    if settings is None:
+        return None, None
     finished = [log_score for log_score in scores if log_score.scored is not None]
     failed = [log_score.manifest for log_score in scores if log_score.scored is None]
     has_images = any(log_score.manifest.frames for log_score in finished)
@@ -175,22 +182,29 @@ def _aggregate(
     for number, (log_score, rollout) in enumerate(zip(finished, reduced, strict=False)):
         mark = None if marks is None else marks.get(number)
         log_score.manifest = _with_values(log_score.manifest, rollout, mark)
+    skipped = _why_skipped(len(finished), len(failed), has_images, settings)
+    files: list[str] = []
+    if reduced and not skipped:
+        files = _write_aggregate(folder, reduced, marks, failed, settings)
     facts: JsonObject = {
         "folder": AGGREGATE,
-        "files": [],
-        "skipped": "",
+        "files": files,
+        "skipped": skipped,
         "error": error and error.as_dict(),
     }
-    if failed and not settings.allow_aggregation_with_failed_rollouts:
-        facts["skipped"] = (
-            f"{len(failed)} of {len(scores)} rollouts failed, and "
+    return facts, error
+
+
+def _why_skipped(n_finished: int, n_failed: int, has_images: bool, settings: EvalSettings) -> str:
+    """Say why AlpaSim's files are not written; empty where they may be."""
+    if n_failed and not settings.allow_aggregation_with_failed_rollouts:
+        return (
+            f"{n_failed} of {n_finished + n_failed} rollouts failed, and "
             "allow_aggregation_with_failed_rollouts is false"
         )
-    elif finished and not has_images:
-        facts["skipped"] = "no log has an image, and its aggregation asks whether images are black"
-    elif reduced:
-        facts["files"] = _write_aggregate(folder, reduced, marks, failed, settings)
-    return facts, error
+    if n_finished and not has_images:
+        return "no log has an image, and its aggregation asks whether images are black"
+    return ""
 
 
 def _marks(reduced: Sequence[ReducedRollout], settings: EvalSettings) -> dict[int, SceneScore]:
