@@ -148,6 +148,11 @@ class GateSpec(_Strict):
             )
         return self
 
+    @property
+    def is_paired(self) -> bool:
+        """Tell whether any rule compares with a baseline."""
+        return any(rule.is_paired for rule in self.metrics.values())
+
 
 def load_gate(
     path_or_name: str | Path, metric_table: MetricTable = METRICS
@@ -299,60 +304,47 @@ def check_gate(
     sides = _sides(rollouts)
     if not sides:
         raise InputError("its rollouts: there are none", "give a run with rollouts")
-    owner = "the run" if stored is None else "the stored baseline"
-    base_sides = sides if stored is None else _sides(stored)
-    is_paired = any(rule.is_paired for rule in spec.metrics.values())
-    variants = list(sides)
-    base: Base | None = None
-    if spec.baseline is not None:
-        base = base_named(spec.baseline, list(base_sides), owner)
-    else:
-        is_one_renderer = len({variant.renderer for variant in variants}) == 1
-        if owner == "the run" and (is_paired or not is_one_renderer):
-            base = usual_base(variants)
-    compares = is_paired or stored is not None or spec.baseline is not None
+    baseline = _baseline(sides, spec, stored, stored_name)
     checks: list[Check] = []
     partners: set[Variant] = set()
-    own_base = base if stored is None else None  # a stored one is in no variant's way
-    for variant in _tested_variants(list(sides), spec, own_base, is_paired):
+    for variant in _tested_variants(list(sides), spec, baseline.in_the_run):
         side = sides[variant]
-        name_in_text = variant.renderer if len(rollouts.policies) == 1 else variant.name
-        if compares:
-            other = _partner(variant, base, list(base_sides), owner)
-            partners.add(other)
-            label = short_name(other, variant)
-            other_side = as_policy(base_sides[other], variant.policy)
-            against = label
-            if stored is not None:
-                against += f" of {stored_name or 'the baseline'}"
-            pair = _Pair(variant, name_in_text, side, other_side, label, against)
+        name = variant.renderer if len(rollouts.policies) == 1 else variant.name
+        if spec.is_paired or spec.baseline is not None or stored is not None:
+            pair = baseline.pair(variant, side, name)
+            partners.add(pair.partner)
             if spec.population == "scenes":
                 checks += _of_scenes(pair, spec, metric_table)
             else:
-                checks += _of_suite(
-                    pair, spec, metric_table, find_preset(preset).stop_after, repeatable is False
-                )
-        for name, rule in spec.metrics.items():
-            if rule.max is not None or rule.min is not None:
-                checks.append(
-                    _limit(side, variant, name_in_text, metric_table.info(name), rule, spec)
-                )
+                stops = find_preset(preset).stop_after
+                checks += _of_suite(pair, spec, metric_table, stops, repeatable is False)
+        checks += _limits(side, variant, name, spec, metric_table)
     failures = failures_of(rollouts)
-    outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
     of_failures = outcome_of_failures(failures, spec.max_failed)
+    outcomes = [Outcome(check.cause, (check.text,)) for check in checks if check.binding]
     outcomes.append(of_failures)
     if stored is not None:
-        outcomes += _lost_variants(sides, base_sides, partners, spec)
-    name = "limits alone" if stored is None else stored_name
-    if base is not None and stored is None:
-        kind = "" if base.renderer and base.policy else "renderer " if base.renderer else "policy "
-        name = f"{kind}{base.name} of the same run"
-    about = SCENES if spec.population == "scenes" else SUITE[repeatable]
-    accepts_failures = failures.n_failed > 0 and of_failures.cause == "pass"
-    sizes = _sizes(checks, spec, metric_table, is_noisy=repeatable is False)
+        outcomes += _lost_variants(sides, baseline.sides, partners, spec)
     return GateVerdict(
-        worst(outcomes), tuple(checks), failures, name, about, sizes, accepts_failures
+        outcome=worst(outcomes),
+        checks=tuple(checks),
+        failures=failures,
+        baseline=baseline.text,
+        about=SCENES if spec.population == "scenes" else SUITE[repeatable],
+        sizes=_sizes(checks, spec, metric_table, is_noisy=repeatable is False),
+        accepts_failures=failures.n_failed > 0 and of_failures.cause == "pass",
     )
+
+
+def _limits(
+    side: Side, variant: Variant, name: str, spec: GateSpec, metric_table: MetricTable
+) -> list[Check]:
+    """Test the means of a variant against the limits that the gate sets."""
+    return [
+        _limit(side, variant, name, metric_table.info(metric), rule, spec)
+        for metric, rule in spec.metrics.items()
+        if rule.max is not None or rule.min is not None
+    ]
 
 
 def _sizes(
@@ -397,9 +389,18 @@ def failures_of(table: RolloutTable) -> Failures:
     return Failures(sum(by_class.values()), table.n_rollouts, by_class)
 
 
-def _tested_variants(
-    variants: list[Variant], spec: GateSpec, base: Base | None, is_paired: bool
-) -> list[Variant]:
+def _tested_variants(variants: list[Variant], spec: GateSpec, base: Base | None) -> list[Variant]:
+    """Return the variants that a gate tests: those behind the renderers that it names, or all but
+    the baseline.
+
+    Args:
+        variants: Of the run.
+        spec: The gate.
+        base: The baseline where it is one of them.
+
+    Raises:
+        InputError: A renderer that the gate names is not there, or nothing is left to compare.
+    """
     renderers = {variant.renderer for variant in variants}
     absent = [name for name in spec.renderers if name not in renderers]
     if absent:
@@ -410,7 +411,7 @@ def _tested_variants(
     if spec.renderers:
         return [variant for variant in variants if variant.renderer in spec.renderers]
     tested = [variant for variant in variants if base is None or base.of(variant) != variant]
-    if not tested and is_paired and base is not None:
+    if not tested and spec.is_paired and base is not None:
         raise InputError(
             f"baseline {base.name!r}: the run has nothing else to compare with it",
             "run two renderers or two policies, or give --baseline-file",
@@ -435,32 +436,112 @@ def _lost_variants(
     return [Outcome("incomplete", (f"{variant.name}: {text}",)) for variant in lost]
 
 
-def _partner(variant: Variant, base: Base | None, others: list[Variant], owner: str) -> Variant:
-    """Return the variant that a variant is compared with; of a stored baseline of one other policy,
-    that policy's.
+@dataclass(frozen=True)
+class _Baseline:
+    """What the variants of a run are compared with.
+
+    Attributes:
+        sides: The variants to choose from: the run's own, or those of a stored baseline.
+        base: Which one it is for each variant; None: the one of the same name.
+        stored_name: How to call the stored baseline; None: the run's own variants are compared.
+    """
+
+    sides: Sides
+    base: Base | None
+    stored_name: str | None
+
+    @property
+    def owner(self) -> str:
+        """Name whose variants these are, for errors."""
+        return "the run" if self.stored_name is None else "the stored baseline"
+
+    @property
+    def in_the_run(self) -> Base | None:
+        """Give the base if it is in the run, where it is not tested itself."""
+        return self.base if self.stored_name is None else None
+
+    @property
+    def text(self) -> str:
+        """Say what was compared with."""
+        if self.stored_name is not None:
+            return self.stored_name
+        if self.base is None:
+            return "limits alone"
+        kind = ""
+        if self.base.policy is None:
+            kind = "renderer "
+        elif self.base.renderer is None:
+            kind = "policy "
+        return f"{kind}{self.base.name} of the same run"
+
+    def pair(self, variant: Variant, side: Side, name: str) -> _Pair:
+        """Return a variant beside its partner.
+
+        Args:
+            variant: Of the run.
+            side: Its rollouts.
+            name: Of the variant in sentences.
+
+        Raises:
+            InputError: It has no partner.
+        """
+        partner = self.partner(variant)
+        label = short_name(partner, variant)
+        against = label
+        if self.stored_name is not None:
+            against += f" of {self.stored_name or 'the baseline'}"
+        base_side = as_policy(self.sides[partner], variant.policy)
+        return _Pair(variant, partner, name, side, base_side, label, against)
+
+    def partner(self, variant: Variant) -> Variant:
+        """Return the variant that a variant is compared with; of a stored baseline of one other
+        policy, that policy's.
+
+        Raises:
+            InputError: There is none.
+        """
+        partner = variant if self.base is None else self.base.of(variant)
+        policies = {other.policy for other in self.sides}
+        if partner not in self.sides and self.base is None and len(policies) == 1:
+            partner = Variant(variant.renderer, *policies)
+        if partner not in self.sides:
+            raise InputError(
+                f"baseline {partner.name!r}: {self.owner} does not have it",
+                f"`baseline` of the gate may be one of: {', '.join(other.name for other in self.sides)}",
+            )
+        return partner
+
+
+def _baseline(
+    sides: Sides, spec: GateSpec, stored: RolloutTable | None, stored_name: str
+) -> _Baseline:
+    """Return what a gate compares the variants of a run with: the baseline that it names; else, of
+    a stored baseline, the variants of the same names, and of the run itself the usual one. Where
+    a gate sets limits alone and there is one renderer, there is nothing to compare with.
 
     Raises:
-        InputError: There is none.
+        InputError: No variant has the name that the gate gives.
     """
-    wanted = variant if base is None else base.of(variant)
-    policies = {other.policy for other in others}
-    if wanted not in others and base is None and len(policies) == 1:
-        wanted = Variant(variant.renderer, *policies)
-    if wanted not in others:
-        raise InputError(
-            f"baseline {wanted.name!r}: {owner} does not have it",
-            f"`baseline` of the gate may be one of: {', '.join(other.name for other in others)}",
-        )
-    return wanted
+    if stored is not None:
+        baseline = _Baseline(_sides(stored), None, stored_name)
+    else:
+        is_one_renderer = len({variant.renderer for variant in sides}) == 1
+        compares = spec.is_paired or not is_one_renderer
+        baseline = _Baseline(sides, usual_base(list(sides)) if compares else None, None)
+    if spec.baseline is None:
+        return baseline
+    base = base_named(spec.baseline, list(baseline.sides), baseline.owner)
+    return replace(baseline, base=base)
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """A variant with its name in sentences, its baseline, and what the baseline is called in entries
-    and in sentences.
+    """A variant with its name in sentences, its partner in the baseline, the rollouts of both, and
+    what the baseline is called in entries and in sentences.
     """
 
     variant: Variant
+    partner: Variant
     name: str
     side: Side
     base: Side
@@ -541,55 +622,83 @@ def _of_suite(
     """Say what changed in these scenes; an event that ends the scored part counts although the gate
     does not name it, since nothing after it was scored.
     """
-    rules = {name: rule for name, rule in spec.metrics.items() if rule.is_paired}
-    unnamed = [stop for stop in stops if stop not in rules]
+    named = {name: rule for name, rule in spec.metrics.items() if rule.is_paired}
+    rules = named | {stop: UNNAMED for stop in stops if stop not in named}
     changes = []
-    for name in (*rules, *unnamed):
+    for name in rules:
         metric = metric_table.info(name)
-        accepted = rules[name].margin_of(metric) if name in rules else metric.accepted
-        changes.append(change_of(pair.side, pair.base, metric, accepted, stops))
-    is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
-    accepted_rules = [rules.get(change.metric.name, UNNAMED) for change in changes]
+        margin = named[name].margin_of(metric) if name in named else metric.accepted
+        changes.append(change_of(pair.side, pair.base, metric, margin, stops))
     noises: Sequence[Noise | None] = [None] * len(changes)
+    is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
     if is_noisy and not is_equal:
-        noises = noises_of(changes, [rule.new_of(spec.max_new) for rule in accepted_rules])
+        noises = noises_of(changes, [rule.new_of(spec.max_new) for rule in rules.values()])
     checks = [
         _suite_check(pair, change, rule, noise, spec)
-        for change, rule, noise in zip(changes, accepted_rules, noises, strict=True)
+        for change, rule, noise in zip(changes, rules.values(), noises, strict=True)
     ]
     if any(check.cause == "regression" for check in checks):
         # It decides; the rollouts that it cut short need not be compared.
-        checks = [
-            replace(
-                check,
-                binding=check.binding and bool(check.entry["n_cells"] or check.entry["missing"]),
-            )
-            for check in checks
-        ]
-    named = checks[: len(rules)]
-    others = checks[len(rules) :]
-    if any(check.cause == "regression" for check in named):
-        return named
-    happened = [change.n_new > 0 for change in changes[len(rules) :]]
-    return [*named, *(check for check, new in zip(others, happened, strict=True) if new)]
+        checks = [replace(check, binding=check.binding and _is_compared(check)) for check in checks]
+    named_checks = checks[: len(named)]
+    if any(check.cause == "regression" for check in named_checks):
+        return named_checks
+    happened = [
+        check
+        for check, change in list(zip(checks, changes, strict=True))[len(named) :]
+        if change.n_new > 0
+    ]
+    return named_checks + happened
+
+
+def _is_compared(check: Check) -> bool:
+    """Tell whether pairs of rollouts were compared, or some that should be are missing."""
+    return bool(check.entry["n_cells"] or check.entry["missing"])
 
 
 def _suite_check(
     pair: _Pair, change: Change, rule: MetricRule, noise: Noise | None, spec: GateSpec
 ) -> Check:
     metric = change.metric
-    max_new = rule.new_of(spec.max_new)
-    verdict = verdict_of(change, max_new, noise)
+    verdict = verdict_of(change, rule.new_of(spec.max_new), noise)
+    entry = _suite_entry(pair, change, rule.new_of(spec.max_new), noise, verdict)
+    text = change_text(entry, metric)
+    cause = CAUSES[verdict]
+    n_cells = entry["n_cells"]
+    n_missing = entry["n_missing"]
+    is_missing = n_missing > spec.max_missing * (n_cells + n_missing)
+    n_scenes = len({pair.side.scene[i] for i in np.flatnonzero(change.is_pair | change.is_cut)})
+    if is_missing or not n_cells:
+        cause = "incomplete"
+    if n_scenes < spec.min_scenes:
+        cause = "incomplete"
+        text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
+    binding = rule.must_decide or is_missing or cause == "regression"
+    return pair.check(metric, cause, text, entry, binding)
+
+
+def _suite_entry(
+    pair: _Pair, change: Change, max_new: int, noise: Noise | None, verdict: Verdict
+) -> JsonObject:
+    """Return what gate.json holds of the change of a metric in these scenes.
+
+    Args:
+        pair: Whose change it is.
+        change: The change.
+        max_new: How many new events are accepted.
+        noise: What tells a change from chance; None: every change is a fact.
+        verdict: What follows.
+    """
+    metric = change.metric
     n_cells = int(np.sum(change.is_pair))
-    n_missing = len(change.missing)
     if metric.is_flag:
         counts = {"new": change.n_new, "gone": change.n_gone}
     else:
         counts = {"worse": int(np.sum(change.beyond(change.margin)))}
         counts["better"] = int(np.sum(change.harms[0] < -change.margin - ROUNDING))
-    n_equal = n_cells - int(np.sum(change.harms[0] != 0.0))
+    counts["equal"] = n_cells - int(np.sum(change.harms[0] != 0.0))
     diff = 0.0 - change.mean if metric.direction == "higher" else change.mean
-    entry = {
+    return {
         "baseline": pair.label,
         "diff": diff if n_cells else None,
         "margin": change.margin,
@@ -600,11 +709,11 @@ def _suite_check(
         "verdict": verdict,
         "n_cells": n_cells,
         "n_scenes": len(change.by_scene(change.now)),
-        "n_missing": n_missing,
+        "n_missing": len(change.missing),
         "n_neither": change.n_neither,
         "n_short": change.n_short,
         "n_far": 0 if metric.is_flag or noise is not None else change.n_far,
-        "counts": counts | {"equal": n_equal},
+        "counts": counts,
         "worst": change.worst(),
         "cut": [
             f"{scene} seed {seed}"
@@ -614,17 +723,6 @@ def _suite_check(
         "missing": [to_json(missing) for missing in change.missing[:LISTED]],
         "seeds": seeds_that_decide(change) if verdict == "undecided" else None,
     }
-    text = change_text(entry, metric)
-    cause = CAUSES[verdict]
-    is_missing = n_missing > spec.max_missing * (n_cells + n_missing)
-    n_scenes = len({pair.side.scene[i] for i in np.flatnonzero(change.is_pair | change.is_cut)})
-    if is_missing or not n_cells:
-        cause = "incomplete"
-    if n_scenes < spec.min_scenes:
-        cause = "incomplete"
-        text += f"; {plural(n_scenes, 'scene')} of at least {spec.min_scenes}"
-    binding = rule.must_decide or is_missing or cause == "regression"
-    return pair.check(metric, cause, text, entry, binding)
 
 
 def _limit(
