@@ -338,37 +338,36 @@ def _notes(root: Element, unused: Counter[str]) -> list[str]:
     notes += [
         f"junctions of type {kind} are not driven through" for kind in sorted(kinds - {*JUNCTIONS})
     ]
-    both_ways = sum(
-        lane.get("type") == "bidirectional" or lane.get("direction") == "both"
-        for lane in root.iter("lane")
-    )
-    if both_ways:
-        notes.append(f"lanes for both directions are driven in one only: {both_ways}")
-    zeros = sum(_is_zero(speed) for speed in root.iter("speed"))
-    if zeros:
-        notes.append(f"speed limits of 0 are taken as none: {zeros}")
-    turned = sum(
+    counts = {
+        "lanes for both directions are driven in one only: {}": sum(
+            lane.get("type") == "bidirectional" or lane.get("direction") == "both"
+            for lane in root.iter("lane")
+        ),
+        "speed limits of 0 are taken as none: {}": sum(map(_is_zero, root.iter("speed"))),
+        "{} lanes are driven as travelDir in their userData says, against the direction of their side": (
+            _n_turned_by_user_data(root)
+        ),
+        "lanes that change their marking inside a section, of which the first holds: {}": sum(
+            len(lane.findall("roadMark")) > 1 for lane in root.iter("lane")
+        ),
+        "lanes that access rules close to cars are not driven by them: {}": sum(
+            map(_closed_to_cars, root.iter("lane"))
+        ),
+        "{} cross section shapes of the map are not used": len(
+            root.findall(".//lateralProfile/shape")
+        ),
+    }
+    return notes + [sentence.format(n) for sentence, n in counts.items() if n]
+
+
+def _n_turned_by_user_data(root: Element) -> int:
+    """Count the lanes without a direction that their userData turns."""
+    return sum(
         _is_reversed(lane, road.get("rule", "RHT").upper() == "LHT")
         for road in root.findall("road")
         for lane in road.iter("lane")
         if lane.get("direction") is None and lane.get("id") != "0"
     )
-    if turned:
-        notes.append(
-            f"{turned} lanes are driven as travelDir in their userData says, against the direction of their side"
-        )
-    repainted = sum(len(lane.findall("roadMark")) > 1 for lane in root.iter("lane"))
-    if repainted:
-        notes.append(
-            f"lanes that change their marking inside a section, of which the first holds: {repainted}"
-        )
-    closed = sum(_closed_to_cars(lane) for lane in root.iter("lane"))
-    if closed:
-        notes.append(f"lanes that access rules close to cars are not driven by them: {closed}")
-    shapes = len(root.findall(".//lateralProfile/shape"))
-    if shapes:
-        notes.append(f"{shapes} cross section shapes of the map are not used")
-    return notes
 
 
 def _odd_sides(elements: Mapping[str, Element]) -> list[str]:

@@ -27,6 +27,7 @@ from alpasim_plugin.core.geometry import (
 )
 from alpasim_plugin.core.types import (
     F64,
+    Actor,
     Box,
     HeightField,
     Lane,
@@ -65,6 +66,7 @@ OVERHANG_M = 0.2  # of a car beyond an axle, at least: its wheels have a radius
 ROAD_HEIGHT_M = 0.3  # wheels that are farther above or below the lanes are not on the road
 JOIN_STEPS = 16  # of a lane through an intersection
 DEFAULT = Vehicle()
+NO_LANES = "the trace holds no lanes to drive on: the driven path is one lane without lane markings"
 
 
 @dataclass
@@ -133,21 +135,13 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         for key, track in tracks.items()
     }
     T_centre_rig = shifted(-vehicle.rear_axle_to_centre_m, 0.0, -vehicle.box.height_m / 2)
-    ego_log = offset_trajectory(centres[chosen], T_centre_rig)
+    ego_log = offset_trajectory(centres.pop(chosen), T_centre_rig)
     if has_lanes:
         lane_map = bordered(lanes, LaneMap({}))
         ground = ground_of(lane_map, ego_log.xyz)
     else:
-        notes.append(
-            "the trace holds no lanes to drive on: the driven path is one lane without lane markings"
-        )
+        notes.append(NO_LANES)
         lane_map, ground = _driven_lane(ego_log)
-    actors = [
-        actor
-        for key, centre in centres.items()
-        if key != chosen
-        for actor in actors_of_track(str(key), tracks[key].label, tracks[key].box, centre)
-    ]
     return RecordedLog(
         f"osi-{file.stem}",
         "osi",
@@ -155,11 +149,20 @@ def read_osi(path: str | Path, ego: str | None = None) -> RecordedLog:
         ground,
         ego_log,
         vehicle,
-        tuple(actors),
+        _actors(tracks, centres),
         (),
         (float(origin[0]), float(origin[1]), 0.0),
         files.content_hash,
         tuple(notes),
+    )
+
+
+def _actors(tracks: Mapping[int, _Track], centres: Mapping[int, Trajectory]) -> tuple[Actor, ...]:
+    """Return the road users of the objects whose centres are given."""
+    return tuple(
+        actor
+        for key, centre in centres.items()
+        for actor in actors_of_track(str(key), tracks[key].label, tracks[key].box, centre)
     )
 
 
