@@ -60,9 +60,8 @@ def distance(view: View, before: View, T_before: tuple[F64, int] | None) -> tupl
     position = before.T_world_camera[1]
     if shutter_us > 0:
         back = dt_us / shutter_us
-        return apart(on_line(end, start, back), position) + _objects_apart(
-            view, before, back
-        ), reach_m
+        ego_m = apart(on_line(end, start, back), position)
+        return ego_m + _objects_apart(view, before, back), reach_m
     if T_before is not None:
         last, last_us = T_before
         return apart(end, on_line(last, position, 1 + dt_us / (before.t_us - last_us))), reach_m
@@ -90,15 +89,22 @@ def apart(a: F64, b: F64) -> float:
 
 
 def _objects_apart(view: View, before: View, back: float) -> float:
-    """Return the mean distance of the dynamic objects that both frames show: it tells drives apart
-    whose traffic differs.
+    """Return the mean distance in metres between where the dynamic objects that both frames show
+    were in the earlier one, and where their motion during the later one's shutter, continued
+    backwards, puts them at that time. It tells drives apart whose traffic differs.
+
+    Args:
+        view: The later frame.
+        before: The earlier one.
+        back: Time between the frames, in shutter times of the later one.
     """
     shared = [track for track in view.objects if track in before.objects]
     if not shared:
         return 0.0
-    then = np.array([before.objects[track][1, :3, 3] for track in shared])
+    logged = np.array([before.objects[track][1, :3, 3] for track in shared])
     start, end = (np.array([view.objects[track][i, :3, 3] for track in shared]) for i in (0, 1))
-    return float(np.linalg.norm(end + back * (start - end) - then, axis=1).mean())
+    predicted = end + back * (start - end)
+    return float(np.linalg.norm(predicted - logged, axis=1).mean())
 
 
 @dataclass(eq=False)
