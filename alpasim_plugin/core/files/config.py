@@ -420,14 +420,8 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     name = dotted(loc)
     last = str(problem["loc"][-1]) if problem["loc"] else ""
     if kind == "extra_forbidden":
-        keys = sorted(_fields_at(model, problem["loc"][:-1]))
-        message = f"unknown key {last!r} in {dotted(loc[:-1])}"
-        sections = {key: _fields_at(model, (key,)) for key in _fields_at(model, ())}
-        elsewhere = {key: f"{name}.{key}" for name, below in sections.items() for key in below}
-        near = _like(last, [*keys, *elsewhere])
-        if near is not None and near not in keys:
-            return message, f"did you mean {elsewhere[near]!r}? valid here: {', '.join(keys)}"
-        return message, _nearest(last, keys)
+        hint = _hint_for_unknown_key(model, last, sorted(_fields_at(model, problem["loc"][:-1])))
+        return f"unknown key {last!r} in {dotted(loc[:-1])}", hint
     if kind == "missing":
         field = _fields_at(model, problem["loc"][:-1]).get(last, {})
         wanted = str(field.get("description") or "see the schema")
@@ -447,6 +441,18 @@ def _explain(model: type[BaseModel], problem: Any, loc: Key) -> tuple[str, str]:
     value = problem["input"]
     content = "is empty" if value is None else f"= {shorten(repr(value), 80)}"
     return f"{name} {content}", f"Give {wanted_of(problem)}."
+
+
+def _hint_for_unknown_key(model: type[BaseModel], key: str, valid_keys: Sequence[str]) -> str:
+    """Name the valid key that is most like an unknown one, be it in another section."""
+    sections = {section: _fields_at(model, (section,)) for section in _fields_at(model, ())}
+    elsewhere = {
+        field: f"{section}.{field}" for section, fields in sections.items() for field in fields
+    }
+    likeness = _like(key, [*valid_keys, *elsewhere])
+    if likeness is not None and likeness not in valid_keys:
+        return f"did you mean {elsewhere[likeness]!r}? valid here: {', '.join(valid_keys)}"
+    return _nearest(key, valid_keys)
 
 
 def _nearest(name: str, choices: Sequence[str]) -> str:
