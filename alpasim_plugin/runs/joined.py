@@ -70,24 +70,11 @@ def missing_shards(infos: Sequence[RunInfo]) -> str | None:
         A run of ``--shard 2/3`` alone gives "shards 1/3 and 3/3 are missing: the verdict is about the
         scenes of all three, so name their runs as well".
     """
-    parts = [SHARD.fullmatch(info.shard) for info in infos if info.shard is not None]
-    numbers = [(int(part[1]), int(part[2])) for part in parts if part is not None]
-    counts = sorted({count for _, count in numbers})
-    if not counts:
+    shards = _shards_of_one_run(infos)
+    if not shards:
         return None
-    if len(counts) > 1 or len(numbers) < len(infos):
-        stated = ", ".join(info.shard or "not divided" for info in infos)
-        raise InputError(
-            f"shards of different runs: {stated}",
-            "Name runs that were driven with one N of --shard I/N.",
-        )
-    twice = sorted({number for number in numbers if numbers.count(number) > 1})
-    if twice:
-        raise InputError(
-            f"shard {twice[0][0]}/{twice[0][1]} is there twice", "Name one run of each shard."
-        )
-    count = counts[0]
-    present = {number for number, _ in numbers}
+    count = shards[0][1]
+    present = {number for number, _ in shards}
     absent = [f"{number}/{count}" for number in range(1, count + 1) if number not in present]
     if not absent:
         return None
@@ -96,6 +83,31 @@ def missing_shards(infos: Sequence[RunInfo]) -> str | None:
         f"{subject} missing: the verdict is about the scenes of all {count} shards,"
         " so name their runs as well"
     )
+
+
+def _shards_of_one_run(infos: Sequence[RunInfo]) -> list[tuple[int, int]]:
+    """Return which shard of how many each run is; nothing where none is a shard.
+
+    Raises:
+        InputError: Runs are divided into different numbers of shards, or one shard is there twice.
+    """
+    matches = [SHARD.fullmatch(info.shard) for info in infos if info.shard is not None]
+    shards = [(int(match[1]), int(match[2])) for match in matches if match is not None]
+    if not shards:
+        return []
+    counts = {count for _, count in shards}
+    if len(counts) > 1 or len(shards) < len(infos):
+        stated = ", ".join(info.shard or "not divided" for info in infos)
+        raise InputError(
+            f"shards of different runs: {stated}",
+            "Name runs that were driven with one N of --shard I/N.",
+        )
+    for number, count in sorted(shards):
+        if shards.count((number, count)) > 1:
+            raise InputError(
+                f"shard {number}/{count} is there twice", "Name one run of each shard."
+            )
+    return shards
 
 
 def check_apart(runs: Sequence[Run]) -> None:
