@@ -40,6 +40,7 @@ from evaluators.pages.flips import (
 )
 from evaluators.pages.images import (
     NO_FRAMES,
+    Rows,
     encoded,
     frame_rows,
     sources,
@@ -105,7 +106,11 @@ class WatchedCell:
         distance from the recorded path.
         """
         driven_m, offsets_m = (
-            [r.metrics[name] or 0.0 for r in self.rollouts if r.metrics.get(name) is not None]
+            [
+                rollout.metrics[name] or 0.0
+                for rollout in self.rollouts
+                if rollout.metrics.get(name) is not None
+            ]
             or [0.0]
             for name in ("dist_traveled_m", "lateral_distance_m")
         )
@@ -200,7 +205,9 @@ def cells_of(run: Run, wanted: Wanted = Wanted(), arms: bool = False) -> list[Wa
             takes[rollout.cell] += 1
             key = (rollout.scene, getattr(rollout, fixed), rollout.seed, take)
             grouped.setdefault(key, []).append(rollout)
-    takes_by_key = dict(zip((one.key for one in run.rollouts), takes_of(run.rollouts), strict=True))
+    takes_by_key = dict(
+        zip((rollout.key for rollout in run.rollouts), takes_of(run.rollouts), strict=True)
+    )
     flips: dict[tuple[str, str, int, int], list[Flip]] = {}
     for flip in find_flips(run)[0]:
         other = flip.other
@@ -294,35 +301,10 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
     firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
     place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
     tracks = Tracks()
-    drives: list[JsonObject] = []
-    for rollout in cell.rollouts:
-        name = {"renderer": cell.side(rollout)}
-        log = logs.get(rollout.path)
-        if not rollout.ok:
-            drives.append(name | {"failed": f"{rollout.failure_class}: {rollout.failure}"})
-        elif not isinstance(log, RolloutLog):
-            why = (
-                log.message
-                if log is not None
-                else f"{_scored_log(run, rollout) or LOG_NAME} is missing"
-            )
-            drives.append(name | {"failed": f"its log cannot be read: {why}"})
-        else:
-            facts = frame_rows(run, rollout)
-            drive = drive_data(run, rollout, log, place, tracks, facts)
-            drive["why"] = run.href(rollout, WHY_NAME) or ""
-            cameras = [encoded(one, place.zero_us) for one in sources(run, rollout, log)]
-            lenses = {camera.name: camera for camera in log.info["cameras"]}
-            for camera in cameras:
-                trust = trust_by_time(facts, camera["name"])
-                by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
-                if by_ms:
-                    camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
-                if camera["name"] in lenses:
-                    camera["lens"] = lens_data(lenses[camera["name"]], camera["width"])
-            drives.append(
-                name | drive | {"cameras": cameras, "no_frames": "" if cameras else NO_FRAMES}
-            )
+    drives = [
+        {"renderer": cell.side(rollout)} | _drive(run, rollout, logs, place, tracks)
+        for rollout in cell.rollouts
+    ]
     keys = {flip.key for flip in cell.flips}
     entries = [entry for entry in flip_entries(run) if key_of_entry(entry) in keys]
     ends = [drive["ego"]["t"][-1] for drive in drives if "ego" in drive]
@@ -339,12 +321,58 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
     }
 
 
+def _drive(run: Run, rollout: Rollout, logs: Logs, place: Place, tracks: Tracks) -> JsonObject:
+    """Return what a page draws of a rollout, camera frames included, or why it has nothing to draw.
+
+    Args:
+        run: The run.
+        rollout: One of its rollouts.
+        logs: By the rollout's path.
+        place: Where numbers count from.
+        tracks: Gets the ways of the road users.
+    """
+    if not rollout.ok:
+        return {"failed": f"{rollout.failure_class}: {rollout.failure}"}
+    log = logs.get(rollout.path)
+    if log is None:
+        file = _scored_log(run, rollout) or LOG_NAME
+        return {"failed": f"its log cannot be read: {file} is missing"}
+    if not isinstance(log, RolloutLog):
+        return {"failed": f"its log cannot be read: {log.message}"}
+    frames = frame_rows(run, rollout)
+    drive = drive_data(run, rollout, log, place, tracks, frames)
+    cameras = _cameras(run, rollout, log, place, frames)
+    return drive | {
+        "why": run.href(rollout, WHY_NAME) or "",
+        "cameras": cameras,
+        "no_frames": "" if cameras else NO_FRAMES,
+    }
+
+
+def _cameras(
+    run: Run, rollout: Rollout, log: RolloutLog, place: Place, frames: Rows
+) -> list[JsonObject]:
+    """Return the camera frames of a rollout with the fixer's trust in each, and with the lens of a
+    camera that the log describes.
+    """
+    cameras = [encoded(source, place.zero_us) for source in sources(run, rollout, log)]
+    specs = {spec.name: spec for spec in log.info["cameras"]}
+    for camera in cameras:
+        trust = trust_by_time(frames, camera["name"])
+        by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
+        if by_ms:
+            camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
+        if camera["name"] in specs:
+            camera["lens"] = lens_data(specs[camera["name"]], camera["width"])
+    return cameras
+
+
 def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
     """Return what projects rig coordinates into an image of at most this width: fx, fy, cx, cy,
     and the mounting, 3 rows of 4.
     """
     scale = min(1.0, width_px / camera.width)
-    k = [round(float(camera.K[at]) * scale, 3) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    k = [round(float(camera.K[index]) * scale, 3) for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
     return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
 
 

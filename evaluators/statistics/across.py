@@ -1,15 +1,16 @@
 """Paired differences within a run, or between two runs on the rollouts that both have."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.run_folder.sides import RolloutTable
 from evaluators.metrics import METRICS, MetricTable
 from evaluators.results import DifferenceTable
 from evaluators.statistics.baselines import check_scenes, scene_hashes, table_of_run
 from evaluators.statistics.opening import Run
 from evaluators.statistics.paired import BLOCKS, Pair, compare_pairs, pairs_within
-from evaluators.statistics.variants import Base, Variant, base_named, choices, variants_in
+from evaluators.statistics.variants import Base, base_named, choices, variants_in
 
 NO_PAIRS: Sequence[Pair] = ()
 
@@ -65,7 +66,10 @@ def compare_within(
         )
     if base is not None and base.policy is not None:
         blocks: dict[str, Sequence[Pair]]
-        pairs = [Pair(own.name, own, other, other.name) for own, other in base.pairs(variants)]
+        pairs = [
+            Pair(variant.name, variant, other, other.name)
+            for variant, other in base.pairs(variants)
+        ]
         blocks = dict.fromkeys(BLOCKS, NO_PAIRS) | {BLOCKS[0]: pairs}
     else:
         blocks = {**pairs_within(table, baseline or run.info.baseline, run.info.bases)}
@@ -100,6 +104,55 @@ def compare_runs(
             policy has no partner, or a metric is another quantity in the other run.
     """
     folders = f"{first.folder} and {second.folder}"
+    _check_alike(first, second, folders)
+    table = table_of_run(second)
+    base_table = table_of_run(first)
+    base_variants = variants_in(base_table)
+    named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
+    names_policy = named is not None and named.policy is not None
+    other_policy = _policy_of_another_name(table, base_table, names_policy)
+    base = named or _usual_partner(base_table)
+    if not names_policy:
+        base = replace(base, policy=other_policy)
+    pairs = []
+    alone = []
+    for variant in variants_in(table):
+        other = base.of(variant)
+        if other.renderer not in base_table.renderers:
+            raise InputError(
+                f"renderer {variant.renderer} of {second.folder}: {first.folder} has "
+                f"{', '.join(base_table.renderers)}",
+                "name one by --baseline",
+            )
+        if other not in base_variants:
+            alone.append(variant.name)
+            continue
+        label = other.name if names_policy else other.renderer
+        has_policy_in_key = len(table.policies) > 1 or names_policy
+        key = variant.name if has_policy_in_key else variant.renderer
+        pairs.append(Pair(key, variant, other, f"{first.folder}: {label}"))
+    if not pairs:
+        raise InputError(
+            f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
+        )
+    partners = {pair.other for pair in pairs}
+    expected = base_variants if baseline is None else []
+    left = [variant.name for variant in expected if variant not in partners]
+    notes = [] if other_policy is None else [_policy_note(table.policies[0], other_policy)]
+    notes += other_weights(first, second)
+    notes += without_partner(alone, second, first)
+    notes += without_partner(left, first, second)
+    metrics = second.table.joined(first.table, {*table.metrics} & {*base_table.metrics}, folders)
+    tables = compare_pairs(table, {BLOCKS[0]: pairs}, metrics, base_table, listed)
+    return Comparison(tables[BLOCKS[0]], notes=tuple(notes), metrics=metrics)
+
+
+def _check_alike(first: Run, second: Run, folders: str) -> None:
+    """Refuse runs that were scored by different rules or drove different scenes.
+
+    Raises:
+        InputError: They differ in preset or in a scene's content, or share no scene.
+    """
     presets = [run.summary.preset for run in (first, second)]
     if presets[0] != presets[1]:
         raise InputError(
@@ -109,59 +162,50 @@ def compare_runs(
     check_scenes(
         scene_hashes(first), scene_hashes(second), folders, "run both on the same scene files"
     )
-    table = table_of_run(second)
-    base = table_of_run(first)
-    base_variants = variants_in(base)
-    named = None if baseline is None else base_named(baseline, base_variants, str(first.folder))
+
+
+def _usual_partner(table: RolloutTable) -> Base:
+    """Return what all variants are compared with: the first run's renderer where it has one, else
+    each variant's own.
+    """
+    return Base(renderer=table.renderers[0]) if len(table.renderers) == 1 else Base()
+
+
+def _policy_of_another_name(
+    table: RolloutTable, base_table: RolloutTable, names_policy: bool
+) -> str | None:
+    """Return the policy of the first run with which that of the second is compared although it has
+    another name: where each run has one. None: policies are compared with those of their names, or
+    with the one that the baseline names.
+
+    Raises:
+        InputError: No policy has a partner.
+    """
+    if {*table.policies} & {*base_table.policies}:
+        return None
+    if len(table.policies) == len(base_table.policies) == 1:
+        return base_table.policies[0]
+    if names_policy:
+        return None
+    raise InputError(
+        f"policies {base_table.policies} and {table.policies}: none in common",
+        "compare runs of one policy each or of the same policies, or name one with "
+        "--baseline RENDERER/POLICY",
+    )
+
+
+def _policy_note(policy: str, other: str) -> str:
+    return f"policy {policy} is compared with policy {other}"
+
+
+def other_weights(first: Run, second: Run) -> tuple[str, ...]:
+    """Say which parts have other weights in the second run: they are other variants, whatever their
+    names.
+    """
     before = first.info.weights
     after = second.info.weights
     changed = sorted(name for name in before.keys() & after.keys() if before[name] != after[name])
-    # what differs in their weights are other variants, whatever their names
-    notes: tuple[str, ...] = (f"other weights: {', '.join(changed)}",) if changed else ()
-    foreign = not {*table.policies} & {*base.policies}
-    if foreign and len(base.policies) == len(table.policies) == 1:
-        note = f"policy {table.policies[0]} is compared with policy {base.policies[0]}"
-        notes = (note, *notes)
-    elif foreign and (named is None or named.policy is None):
-        raise InputError(
-            f"policies {base.policies} and {table.policies}: none in common",
-            "compare runs of one policy each or of the same policies, or name one with "
-            "--baseline RENDERER/POLICY",
-        )
-    if named is None:
-        named = Base(renderer=base.renderers[0]) if len(base.renderers) == 1 else Base()
-    elif named.policy is not None:
-        foreign = False
-    several = len(table.policies) > 1 or named.policy is not None
-    pairs = []
-    alone = []
-    for variant in variants_in(table):
-        other = named.of(variant)
-        if foreign:
-            other = Variant(other.renderer, base.policies[0])
-        if other.renderer not in base.renderers:
-            raise InputError(
-                f"renderer {variant.renderer} of {second.folder}: {first.folder} has "
-                f"{', '.join(base.renderers)}",
-                "name one by --baseline",
-            )
-        if other in base_variants:
-            called = other.name if named.policy is not None else other.renderer
-            key = variant.name if several else variant.renderer
-            pairs.append(Pair(key, variant, other, f"{first.folder}: {called}"))
-        else:
-            alone.append(variant.name)
-    if not pairs:
-        raise InputError(
-            f"baseline {baseline!r}: behind no renderer of {second.folder}", "name RENDERER/POLICY"
-        )
-    partners = {pair.other for pair in pairs}
-    left = [] if baseline is not None else base_variants
-    notes += without_partner(alone, second, first)
-    notes += without_partner([one.name for one in left if one not in partners], first, second)
-    metrics = second.table.joined(first.table, {*table.metrics} & {*base.metrics}, folders)
-    tables = compare_pairs(table, {BLOCKS[0]: pairs}, metrics, base, listed)
-    return Comparison(tables[BLOCKS[0]], notes=notes, metrics=metrics)
+    return (f"other weights: {', '.join(changed)}",) if changed else ()
 
 
 def without_partner(names: Sequence[str], run: Run, other: Run) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ collision event are dropped, the event's own step stays; flags are reduced by th
 metrics as they say themselves.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,15 +84,7 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
         )
     for name, parts in _DERIVED_FLAGS.items():
         if name not in table and all(part in table for part in parts):
-            # 1 where any is known to be 1, unknown where none is and one is unknown.
-            flags = [table[part] for part in parts]
-            fired = np.any([np.where(part.valid, part.value, 0.0) > 0 for part in flags], axis=0)
-            is_valid = fired | np.all([part.valid for part in flags], axis=0)
-            value = np.where(is_valid, fired.astype(np.float64), np.nan)
-            reason = (
-                "" if bool(is_valid.all()) else next(part.reason for part in flags if part.reason)
-            )
-            table[name] = MetricSeries(METRICS[name], flags[0].t_us, value, is_valid, reason)
+            table[name] = _any_of(name, [table[part] for part in parts])
     first_us, last_us, ledger = _window(table, chosen)
     # eval_relevant selects steps; as a value of its own it says nothing, but AlpaSim's tables have
     # it.
@@ -109,14 +101,8 @@ def reduce_rollout(series: Sequence[MetricSeries], preset: str | Preset = DEFAUL
         )
     if "progress_rel_to_total" in values:
         values["progress_clipped_rel"] = values["progress_rel_to_total"]
-    begins = (
-        []
-        if ledger.dropped
-        else [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
-    )
-    times = [(t, name) for t, name in begins if t is not None and t <= last_us]
-    events = ({"metric": name, "t_us": t} for t, name in sorted(times, key=lambda event: event[0]))
-    return Reduction(values, ledger, tuple(events))
+    events = () if ledger.dropped else _events(table, first_us, last_us)
+    return Reduction(values, ledger, events)
 
 
 _DERIVED_FLAGS = {
@@ -124,6 +110,27 @@ _DERIVED_FLAGS = {
     "offroad_or_collision": ("collision_any", "offroad"),
     "offroad_or_collision_at_fault": ("collision_at_fault", "offroad"),
 }
+
+
+def _any_of(name: str, flags: Sequence[MetricSeries]) -> MetricSeries:
+    """Return a flag that is 1 where any of some flags is known to be 1, and unknown where none is
+    and one is unknown.
+    """
+    fired = np.any([np.where(flag.valid, flag.value, 0.0) > 0 for flag in flags], axis=0)
+    is_valid = fired | np.all([flag.valid for flag in flags], axis=0)
+    value = np.where(is_valid, fired.astype(np.float64), np.nan)
+    reason = "" if bool(is_valid.all()) else next(flag.reason for flag in flags if flag.reason)
+    return MetricSeries(METRICS[name], flags[0].t_us, value, is_valid, reason)
+
+
+def _events(
+    table: Mapping[str, MetricSeries], first_us: int, last_us: int
+) -> tuple[JsonObject, ...]:
+    """Return the events between two instants, each with the time at which it begins, in order."""
+    begins = [(_first_time(table[name], first_us), name) for name in EVENTS if name in table]
+    times = [(t_us, name) for t_us, name in begins if t_us is not None and t_us <= last_us]
+    times.sort(key=lambda event: event[0])
+    return tuple({"metric": name, "t_us": t_us} for t_us, name in times)
 
 
 def _window(table: dict[str, MetricSeries], preset: Preset) -> tuple[int, int, Ledger]:
