@@ -38,67 +38,76 @@ Examples:
 """
 
 
+Out = Annotated[
+    Path, typer.Option("--out", help="Folder for results; the same command continues there.")
+]
+Fixers = Annotated[
+    str,
+    typer.Option("--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE."),
+]
+InputKindOption = Annotated[
+    InputKind,
+    typer.Option(
+        "--input",
+        help="What fixers get: the degraded render; the ground truth, opaque, which they should leave alone; or the truth "
+        "that has lost resolution (blur, cells of 2 to 4 pixels, up to 3 holes that stay in place).",
+    ),
+]
+Baseline = Annotated[
+    str, typer.Option("--baseline", help="Variant that the others are compared with.")
+]
+Frames = Annotated[
+    int,
+    typer.Option(
+        "--frames", min=2, help="First frames of every clip; shorter clips are taken whole."
+    ),
+]
+Clips = Annotated[
+    int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers."),
+]
+Weights = Annotated[
+    Path | None,
+    typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}."),
+]
+Pictures = Annotated[
+    int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
+]
+Device = Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        "--jobs",
+        min=1,
+        help="Clips at a time, one thread each; times are then of a busy machine.",
+    ),
+]
+Threads = Annotated[int, typer.Option("--threads", min=1, help="Torch threads with one job.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the summary as one JSON document on stdout.")
+]
+
+
 def quality(
     data: Annotated[Path, typer.Argument(help="Folder of pairs (docs/lab/training.md).")],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for results; the same command continues there.")
-    ],
-    fixers: Annotated[
-        str,
-        typer.Option(
-            "--fixer", help="Comma-separated: 3dgs, NAME[@STEPS], LABEL=NAME, LABEL=FILE."
-        ),
-    ] = "3dgs",
+    out: Out,
+    fixers: Fixers = "3dgs",
     split: Annotated[str, typer.Option("--split", help="Split to measure on.")] = "test-known",
-    input_kind: Annotated[
-        InputKind,
-        typer.Option(
-            "--input",
-            help="What fixers get: the degraded render; the ground truth, opaque, which they should leave alone; or the truth "
-            "that has lost resolution (blur, cells of 2 to 4 pixels, up to 3 holes that stay in place).",
-        ),
-    ] = "render",
-    baseline: Annotated[
-        str, typer.Option("--baseline", help="Variant that the others are compared with.")
-    ] = RAW,
-    frames: Annotated[
-        int,
-        typer.Option(
-            "--frames", min=2, help="First frames of every clip; shorter clips are taken whole."
-        ),
-    ] = 198,
-    clips: Annotated[
-        int | None, typer.Option("--clips", min=1, help="At most so many clips, evenly chosen.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="[LABEL:]fixer.key=value, of one variant or of all fixers."),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}."),
-    ] = None,
-    pictures: Annotated[
-        int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
-    ] = 4,
+    input_kind: InputKindOption = "render",
+    baseline: Baseline = RAW,
+    frames: Frames = 198,
+    clips: Clips = None,
+    overrides: Overrides = None,
+    weights: Weights = None,
+    pictures: Pictures = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
-    device: Annotated[
-        Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")
-    ] = "cpu",
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "--jobs",
-            min=1,
-            help="Clips at a time, one thread each; times are then of a busy machine.",
-        ),
-    ] = 1,
-    threads: Annotated[
-        int, typer.Option("--threads", min=1, help="Torch threads with one job.")
-    ] = 1,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the summary as one JSON document on stdout.")
-    ] = False,
+    device: Device = "cpu",
+    jobs: Jobs = 1,
+    threads: Threads = 1,
+    as_json: AsJson = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
     """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time,
@@ -109,11 +118,7 @@ def quality(
     """
     del debug
     variants = parse_variants(fixers, overrides or [])
-    if baseline not in {variant.label for variant in variants}:
-        raise InputError(
-            f"--baseline {baseline}: variants {', '.join(a.label for a in variants)}",
-            "name one of the variants",
-        )
+    check_baseline(baseline, variants)
     sequences = evenly(PairDataset(data, split).sequences, clips)
     pictured_names = (
         {sequence.name for sequence in evenly(sequences, pictures)} if pictures else set()
@@ -147,6 +152,19 @@ def quality(
         say_document(summary)
     else:
         print(f"{markdown(summary)}\nwrote {out / 'quality.json'}")
+
+
+def check_baseline(baseline: str, variants: Sequence[Variant]) -> None:
+    """Refuse a baseline that is not measured.
+
+    Raises:
+        InputError: No variant has that label.
+    """
+    labels = [variant.label for variant in variants]
+    if baseline not in labels:
+        raise InputError(
+            f"--baseline {baseline}: variants {', '.join(labels)}", "name one of the variants"
+        )
 
 
 def parse_variants(text: str, overrides: Sequence[str]) -> tuple[Variant, ...]:

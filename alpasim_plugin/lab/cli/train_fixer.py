@@ -47,11 +47,19 @@ DECODER = "decoder"
 PRECISIONS: Mapping[str, torch.dtype | None] = {"fp32": None, "bf16": torch.bfloat16}
 
 
-def trainable_settings(name: str) -> TrainableSettings:
+def trainable_settings(
+    name: str, recipe: str, has_attention_options: bool = False
+) -> TrainableSettings:
     """Return the settings of a shipped fixer that a recipe can be trained for.
 
+    Args:
+        name: The fixer.
+        recipe: The recipe, for errors.
+        has_attention_options: Whether the command sets blocks, window or sink.
+
     Raises:
-        InputError: Unknown, or a fixer without latents.
+        InputError: Unknown, a fixer without latents, or options of attention for a fixer without a
+            history.
     """
     settings = fixer_settings(name)
     if not isinstance(settings, TrainableSettings):
@@ -59,40 +67,93 @@ def trainable_settings(name: str) -> TrainableSettings:
             f"--fixer {name}: it has no networks on latents",
             "leave it out, or choose a block generator, such as onefixer-dit-tiny",
         )
+    if has_attention_options and not isinstance(settings, OneFixerSettings):
+        raise InputError(
+            f"recipe {recipe}: it has no blocks and no history",
+            "leave out --block, --window and --sink",
+        )
     return settings
+
+
+Recipe = Annotated[
+    str,
+    typer.Option(
+        "--recipe",
+        help=f"{VAE}: the autoencoder; {DECODER}: the decoder of --init; or {', '.join(RECIPES)}.",
+    ),
+]
+Vae = Annotated[
+    Path | None,
+    typer.Option("--vae", help="Trained autoencoder (recipe vae), or a fixer's bundle."),
+]
+Video = Annotated[
+    Path | None,
+    typer.Option("--video", help="Recipe vae: folder of driving video, as further clips."),
+]
+Init = Annotated[
+    Path | None,
+    typer.Option("--init", help="Initial weights: a run's fixer.safetensors, or a transformer."),
+]
+Weights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--weights",
+        help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained.",
+    ),
+]
+SourceShare = Annotated[
+    float,
+    typer.Option(
+        "--source-share",
+        min=0.0,
+        max=0.8,
+        help="Recipe base: share of positions at t = 1, the start of sampling.",
+    ),
+]
+Objective = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--objective",
+        help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4.",
+    ),
+]
+Block = Annotated[
+    int | None,
+    typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's."),
+]
+Window = Annotated[
+    int | None,
+    typer.Option("--window", min=1, help="Attention window in latents, instead of the recipe's."),
+]
+Sink = Annotated[
+    int | None,
+    typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's."),
+]
+ClassColourAugmentation = Annotated[
+    bool,
+    typer.Option(
+        "--class-colour-augmentation/--no-class-colour-augmentation",
+        help="Show the map's cars in the colours of another class in mirrored clips.",
+    ),
+]
+StopAt = Annotated[
+    int | None,
+    typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
+]
+SizesOf = Annotated[
+    str | None,
+    typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's."),
+]
 
 
 def fixer(
     data: options.Pairs,
     out: options.RunFolder,
-    recipe: Annotated[
-        str,
-        typer.Option(
-            "--recipe",
-            help=f"{VAE}: the autoencoder; {DECODER}: the decoder of --init; or {', '.join(RECIPES)}.",
-        ),
-    ] = "V9",
-    vae: Annotated[
-        Path | None,
-        typer.Option("--vae", help="Trained autoencoder (recipe vae), or a fixer's bundle."),
-    ] = None,
-    video: Annotated[
-        Path | None,
-        typer.Option("--video", help="Recipe vae: folder of driving video, as further clips."),
-    ] = None,
-    init: Annotated[
-        Path | None,
-        typer.Option(
-            "--init", help="Initial weights: a run's fixer.safetensors, or a transformer."
-        ),
-    ] = None,
-    weights: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--weights",
-            help="NAME=FILE, repeatable: init-bi, of bidirectional networks; or a stage, which is then not trained.",
-        ),
-    ] = None,
+    recipe: Recipe = "V9",
+    vae: Vae = None,
+    video: Video = None,
+    init: Init = None,
+    weights: Weights = None,
     size: options.Size = None,
     steps: options.Unit = 400,
     clips: options.Clips = 4,
@@ -102,57 +163,20 @@ def fixer(
     stride: options.Stride = 24,
     lr: options.PeakLr = 2e-4,
     ema: options.Ema = 0.99,
-    source_share: Annotated[
-        float,
-        typer.Option(
-            "--source-share",
-            min=0.0,
-            max=0.8,
-            help="Recipe base: share of positions at t = 1, the start of sampling.",
-        ),
-    ] = 0.35,
-    objective: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--objective",
-            help="KEY=VALUE or STAGE.KEY=VALUE of the recipe's objectives, repeatable, such as dmd.steps=4.",
-        ),
-    ] = None,
-    block: Annotated[
-        int | None,
-        typer.Option("--block", min=1, help="Latents of a block, instead of the recipe's."),
-    ] = None,
-    window: Annotated[
-        int | None,
-        typer.Option(
-            "--window", min=1, help="Attention window in latents, instead of the recipe's."
-        ),
-    ] = None,
-    sink: Annotated[
-        int | None,
-        typer.Option("--sink", min=0, help="Attention sink in latents, instead of the recipe's."),
-    ] = None,
+    source_share: SourceShare = 0.35,
+    objective: Objective = None,
+    block: Block = None,
+    window: Window = None,
+    sink: Sink = None,
     perceptual: options.Perceptual = 10.0,
     channels: options.Channels = "amplitude",
-    class_colour_augmentation: Annotated[
-        bool,
-        typer.Option(
-            "--class-colour-augmentation/--no-class-colour-augmentation",
-            help="Show the map's cars in the colours of another class in mirrored clips.",
-        ),
-    ] = True,
-    stop_at: Annotated[
-        int | None,
-        typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
-    ] = None,
+    class_colour_augmentation: ClassColourAugmentation = True,
+    stop_at: StopAt = None,
     precision: options.Precision = "fp32",
     device: options.Device = "cpu",
     threads: options.Threads = None,
     seed: options.Seed = 0,
-    sizes_of: Annotated[
-        str | None,
-        typer.Option("--fixer", help="Fixer that gives the sizes; by default the recipe's."),
-    ] = None,
+    sizes_of: SizesOf = None,
     metric_weights: options.MetricWeights = None,
     as_json: options.AsJson = False,
     debug: options.Debug = False,
@@ -162,21 +186,18 @@ def fixer(
     """
     del debug
     options.use_threads(threads)
-    own_size = None if size is None else parse_size(size)
+    image_size = None if size is None else parse_size(size)
     data = pairs_folder(data, out)
     video = None if video is None else pairs_folder(video, out)
+    form = ClipForm(latents, stride, class_colour_augmentation)
+    progress = options.Progress(steps)
     if recipe == VAE:
-        progress = options.Progress(steps)
         path = train_vae(data, video, out, steps, seed, init, progress.update, device)
         progress.wrote(path, as_json)
         return
-    form = ClipForm(latents, stride, class_colour_augmentation)
     if recipe == DECODER:
-        if init is None:
-            raise InputError("--recipe decoder: no trained fixer", "Give one with --init.")
-        progress = options.Progress(steps)
         path = finetune_decoder(
-            init,
+            required(init, "--recipe decoder: no trained fixer", "Give one with --init."),
             data,
             out,
             form,
@@ -185,26 +206,21 @@ def fixer(
             progress.perceptual_term(metric_weights, device),
             partial(progress.prepared, interval=50),
             progress.update,
-            own_size,
+            image_size,
             device,
         )
         progress.wrote(path, as_json)
         return
-    if vae is None:
-        raise InputError(
-            f"--recipe {recipe}: no autoencoder", "Give one with --vae; --recipe vae trains it."
-        )
-    chosen = with_perceptual_weight(with_source_share(recipe_of(recipe), source_share), perceptual)
-    chosen = with_attention(with_objective(chosen, objective or []), block, window, sink)
-    settings = trainable_settings(sizes_of or chosen.fixer)
-    if not isinstance(settings, OneFixerSettings) and (block, window, sink) != (None, None, None):
-        raise InputError(
-            f"recipe {recipe}: it has no blocks and no history",
-            "leave out --block, --window and --sink",
-        )
+    no_vae = f"--recipe {recipe}: no autoencoder"
+    vae = required(vae, no_vae, "Give one with --vae; --recipe vae trains it.")
+    weighted = with_perceptual_weight(
+        with_source_share(recipe_of(recipe), source_share), perceptual
+    )
+    adapted = with_attention(with_objective(weighted, objective or []), block, window, sink)
+    has_attention_options = (block, window, sink) != (None, None, None)
     run = FixerRun(
-        settings,
-        chosen,
+        trainable_settings(sizes_of or adapted.fixer, recipe, has_attention_options),
+        adapted,
         data,
         vae,
         named_weights(init, weights or []),
@@ -213,7 +229,7 @@ def fixer(
         Schedule(steps, peak_lr=lr, accumulate=accumulate, ema=ema).of_length(steps),
         channels == "equal",
         PRECISIONS[precision],
-        own_size,
+        image_size,
         device,
     )
     progress = options.Progress(run.updates)
@@ -221,6 +237,17 @@ def fixer(
     distance = progress.perceptual_term(metric_weights, device) if run.perceptual else None
     encoded = partial(progress.prepared, "clips as latents, sequences")
     progress.wrote(train_fixer(run, out, distance, encoded, progress.update, stop_at), as_json)
+
+
+def required(path: Path | None, problem: str, hint: str) -> Path:
+    """Return a file without which a recipe cannot be trained.
+
+    Raises:
+        InputError: It is not named.
+    """
+    if path is None:
+        raise InputError(problem, hint)
+    return path
 
 
 def named_weights(init: Path | None, pairs: Sequence[str]) -> dict[str, Path]:

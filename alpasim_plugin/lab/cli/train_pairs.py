@@ -31,56 +31,60 @@ Examples:
 """
 
 
+Sources = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SCENES|VIDEO...",
+        help="Folder that 'simrun train scenes' wrote; or driving videos whose licence lets you train on them.",
+    ),
+]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")]
+Split = Annotated[
+    str, typer.Option("--split", help="Splits of the scenes, comma-separated, in this order.")
+]
+Source = Annotated[str, typer.Option("--source", help="Renderer of the degraded frames.")]
+MaxOffsetM = Annotated[
+    float,
+    typer.Option("--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres."),
+]
+OffsetM = Annotated[
+    float | None,
+    typer.Option("--offset-m", help="One lateral offset for all frames, metres, left positive."),
+]
+Count = Annotated[
+    int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")
+]
+Size = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--size", metavar="WIDTHxHEIGHT", help="Of videos; repeatable, by default 256x144."
+    ),
+]
+Variants = Annotated[
+    int, typer.Option("--variants", min=1, help="Differently damaged sequences of a video.")
+]
+Pack = Annotated[
+    Path | None,
+    typer.Option(
+        "--pack",
+        help="Also write the sequences into this file of at most 40 MB, images as video: it stands for a folder of pairs in training.",
+    ),
+]
+
+
 def pairs(
-    sources: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SCENES|VIDEO...",
-            help="Folder that 'simrun train scenes' wrote; or driving videos whose licence lets you train on them.",
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder to write to; the same command resumes.")
-    ],
-    split: Annotated[
-        str, typer.Option("--split", help="Splits of the scenes, comma-separated, in this order.")
-    ] = "val,train",
-    source: Annotated[
-        str, typer.Option("--source", help="Renderer of the degraded frames.")
-    ] = "3dgs",
-    max_offset_m: Annotated[
-        float,
-        typer.Option(
-            "--max-offset-m", min=0.0, help="Largest lateral offset from the log, metres."
-        ),
-    ] = 2.5,
-    offset_m: Annotated[
-        float | None,
-        typer.Option(
-            "--offset-m", help="One lateral offset for all frames, metres, left positive."
-        ),
-    ] = None,
-    count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Only the first N scenes of each split.")
-    ] = None,
-    size: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--size", metavar="WIDTHxHEIGHT", help="Of videos; repeatable, by default 256x144."
-        ),
-    ] = None,
-    variants: Annotated[
-        int, typer.Option("--variants", min=1, help="Differently damaged sequences of a video.")
-    ] = 2,
+    sources: Sources,
+    out: Out,
+    split: Split = "val,train",
+    source: Source = "3dgs",
+    max_offset_m: MaxOffsetM = 2.5,
+    offset_m: OffsetM = None,
+    count: Count = None,
+    size: Size = None,
+    variants: Variants = 2,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of offsets and damage.")] = 0,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes, one thread each.")] = 1,
-    pack: Annotated[
-        Path | None,
-        typer.Option(
-            "--pack",
-            help="Also write the sequences into this file of at most 40 MB, images as video: it stands for a folder of pairs in training.",
-        ),
-    ] = None,
+    pack: Pack = None,
     device: Device = "cpu",
     as_json: AsJson = False,
     debug: Debug = False,

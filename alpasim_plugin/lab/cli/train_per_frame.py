@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,97 +31,103 @@ Examples:
 """
 
 
+Video = Annotated[
+    Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/training.md).")
+]
+Sequences = Annotated[
+    int | None,
+    typer.Option("--sequences", min=1, help="Only the first N sequences, in order of generation."),
+]
+DecayFrom = Annotated[
+    int | None,
+    typer.Option(
+        "--decay-from",
+        min=1,
+        help="Update at which the learning rate begins to fall; by default at 4/5.",
+    ),
+]
+StopAt = Annotated[
+    int | None,
+    typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
+]
+Warmup = Annotated[
+    int,
+    typer.Option("--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on."),
+]
+Ema = Annotated[
+    float,
+    typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights."),
+]
+Streams = Annotated[int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")]
+Frames = Annotated[
+    int,
+    typer.Option("--frames", min=2, help="Frames of an update: k, that gradients pass through."),
+]
+Episode = Annotated[
+    int, typer.Option("--episode", min=1, help="Updates that a stream stays with a sequence.")
+]
+Crop = Annotated[str, typer.Option("--crop", help="WIDTHxHEIGHT of a crop, multiples of 16.")]
+Perceptual = Annotated[
+    float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")
+]
+Temporal = Annotated[
+    float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")
+]
+Flow = Annotated[
+    float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")
+]
+Grid = Annotated[
+    float,
+    typer.Option(
+        "--grid", min=0.0, help="Weight of the term against patterns of the network's grid."
+    ),
+]
+Variant = Annotated[
+    str,
+    typer.Option("--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}."),
+]
+Init = Annotated[
+    Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")
+]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")
+]
+SaveEvery = Annotated[int, typer.Option("--save-every", min=1, help="Updates between checkpoints.")]
+KeepEvery = Annotated[
+    int,
+    typer.Option("--keep-every", min=0, help="Updates between bundles that are kept; 0: the last."),
+]
+Precision = Annotated[
+    Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")
+]
+
+
 def per_frame(
     data: options.Pairs,
     out: options.RunFolder,
-    video: Annotated[
-        Path | None, typer.Option("--video", help="Folder of driving video (docs/lab/training.md).")
-    ] = None,
-    sequences: Annotated[
-        int | None,
-        typer.Option(
-            "--sequences", min=1, help="Only the first N sequences, in order of generation."
-        ),
-    ] = None,
+    video: Video = None,
+    sequences: Sequences = None,
     steps: options.Steps = 20_000,
-    decay_from: Annotated[
-        int | None,
-        typer.Option(
-            "--decay-from",
-            min=1,
-            help="Update at which the learning rate begins to fall; by default at 4/5.",
-        ),
-    ] = None,
-    stop_at: Annotated[
-        int | None,
-        typer.Option("--stop-at", min=1, help="Stop after this update and write the weights."),
-    ] = None,
+    decay_from: DecayFrom = None,
+    stop_at: StopAt = None,
     lr: options.PeakLr = 1e-3,
-    warmup: Annotated[
-        int,
-        typer.Option(
-            "--warmup", min=0, help="Updates of rising learning rate; 0 where a run goes on."
-        ),
-    ] = 100,
-    ema: Annotated[
-        float,
-        typer.Option("--ema", min=0.0, max=0.99999, help="Decay of the averaged (EMA) weights."),
-    ] = 0.998,
-    streams: Annotated[
-        int, typer.Option("--streams", min=1, help="Streams of frames in a batch.")
-    ] = 6,
-    frames: Annotated[
-        int,
-        typer.Option(
-            "--frames", min=2, help="Frames of an update: k, that gradients pass through."
-        ),
-    ] = 4,
-    episode: Annotated[
-        int, typer.Option("--episode", min=1, help="Updates that a stream stays with a sequence.")
-    ] = 12,
-    crop: Annotated[
-        str, typer.Option("--crop", help="WIDTHxHEIGHT of a crop, multiples of 16.")
-    ] = "128x96",
-    perceptual: Annotated[
-        float, typer.Option("--perceptual", min=0.0, help="Weight of the perceptual term.")
-    ] = 0.1,
-    temporal: Annotated[
-        float, typer.Option("--temporal", min=0.0, help="Weight of the frames' differences.")
-    ] = 0.25,
-    flow: Annotated[
-        float, typer.Option("--flow", min=0.0, help="Weight of flow matching below t = 1.")
-    ] = 0.25,
-    grid: Annotated[
-        float,
-        typer.Option(
-            "--grid", min=0.0, help="Weight of the term against patterns of the network's grid."
-        ),
-    ] = 0.01,
-    variant: Annotated[
-        str,
-        typer.Option(
-            "--variant", help=f"Row of the paper's ablation: {', '.join(PIXEL_VARIANTS)}."
-        ),
-    ] = DEPLOYED,
-    init: Annotated[
-        Path | None, typer.Option("--init", help="Another run's state.safetensors, or a bundle.")
-    ] = None,
+    warmup: Warmup = 100,
+    ema: Ema = 0.998,
+    streams: Streams = 6,
+    frames: Frames = 4,
+    episode: Episode = 12,
+    crop: Crop = "128x96",
+    perceptual: Perceptual = 0.1,
+    temporal: Temporal = 0.25,
+    flow: Flow = 0.25,
+    grid: Grid = 0.01,
+    variant: Variant = DEPLOYED,
+    init: Init = None,
     fixer: Annotated[str, typer.Option("--fixer", help="Fixer that gives the sizes.")] = "onefixer",
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="A setting of that fixer: fixer.key=value.")
-    ] = None,
-    save_every: Annotated[
-        int, typer.Option("--save-every", min=1, help="Updates between checkpoints.")
-    ] = 200,
-    keep_every: Annotated[
-        int,
-        typer.Option(
-            "--keep-every", min=0, help="Updates between bundles that are kept; 0: the last."
-        ),
-    ] = 1000,
-    precision: Annotated[
-        Literal["fp32", "bf16"], typer.Option("--precision", help="Of the forward passes.")
-    ] = "fp32",
+    overrides: Overrides = None,
+    save_every: SaveEvery = 200,
+    keep_every: KeepEvery = 1000,
+    precision: Precision = "fp32",
     device: options.Device = "cpu",
     threads: options.Threads = None,
     seed: options.Seed = 0,
@@ -137,12 +144,6 @@ def per_frame(
     del debug
     options.use_threads(threads)
     progress = options.Progress(steps, interval=25)
-    settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides or [])])
-    if not isinstance(settings, PixelFixerSettings):
-        raise InputError(
-            f"--fixer {fixer}: it is no generator in pixels",
-            "choose onefixer; 'simrun train fixer' trains the block generators",
-        )
     width, height = parse_size(crop, "--crop", 16)
     shares = StreamShares() if video is not None else WITHOUT_VIDEO
     source = TrainingStreams(
@@ -172,6 +173,29 @@ def per_frame(
     distance = progress.perceptual_term(metric_weights, device) if needs_distance else None
     dtype = torch.bfloat16 if precision == "bf16" else None
     run = PixelRun(
-        settings, source, chosen_variant, schedule, init, seed, dtype, keep_every, device
+        pixel_settings(fixer, overrides or []),
+        source,
+        chosen_variant,
+        schedule,
+        init,
+        seed,
+        dtype,
+        keep_every,
+        device,
     )
     progress.wrote(train_per_frame(run, out, distance, stop_at, progress.update), as_json)
+
+
+def pixel_settings(fixer: str, overrides: Sequence[str]) -> PixelFixerSettings:
+    """Return the settings of a generator in pixels, without the weights that it ships with.
+
+    Raises:
+        InputError: Unknown, or another kind of fixer.
+    """
+    settings = fixer_settings(fixer, ["weights.bundle=null", *fixer_overrides(overrides)])
+    if not isinstance(settings, PixelFixerSettings):
+        raise InputError(
+            f"--fixer {fixer}: it is no generator in pixels",
+            "choose onefixer; 'simrun train fixer' trains the block generators",
+        )
+    return settings

@@ -21,32 +21,34 @@ from scenarios.load import load_scenario
 EPILOG = "Example: `simrun train photographs photos/ --out data/photographs`"
 
 
+Folder = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder with images and the transforms.json of Instant-NGP, or an imported drive."
+    ),
+]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write to; the same command resumes.")]
+Name = Annotated[
+    str | None, typer.Option("--name", help="Of the sequences; the folder's by default.")
+]
+Width = Annotated[int, typer.Option("--width", min=16, help="Pixels across, a multiple of 16.")]
+Period = Annotated[
+    int,
+    typer.Option("--every", min=2, help="Hold out every N-th photograph, in N ways: N sequences."),
+]
+Steps = Annotated[
+    int, typer.Option("--steps", min=1, help="Updates of the fit; few leave it under-trained.")
+]
+
+
 def photographs(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder with images and the transforms.json of Instant-NGP, or an imported drive."
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder to write to; the same command resumes.")
-    ],
-    name: Annotated[
-        str | None, typer.Option("--name", help="Of the sequences; the folder's by default.")
-    ] = None,
+    folder: Folder,
+    out: Out,
+    name: Name = None,
     split: Annotated[str, typer.Option("--split", help="Split of the sequences.")] = "test",
-    width: Annotated[
-        int, typer.Option("--width", min=16, help="Pixels across, a multiple of 16.")
-    ] = 256,
-    period: Annotated[
-        int,
-        typer.Option(
-            "--every", min=2, help="Hold out every N-th photograph, in N ways: N sequences."
-        ),
-    ] = 5,
-    steps: Annotated[
-        int, typer.Option("--steps", min=1, help="Updates of the fit; few leave it under-trained.")
-    ] = 300,
+    width: Width = 256,
+    period: Period = 5,
+    steps: Steps = 300,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fit.")] = 0,
     device: Device = "cpu",
     as_json: AsJson = False,

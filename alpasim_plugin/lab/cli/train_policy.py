@@ -155,8 +155,14 @@ def write_splits(scenes: Path, data: Path, seed: int) -> None:
 def demonstration_facts(task: PolicyTask) -> dict[str, Any]:
     """Return the training data of a policy: frames, samples, scenes by family, and the renderer."""
     return {
-        "frames": sum(len(frames) for one in task.demonstrations for frames in one.frames),
+        "frames": sum(
+            len(frames) for demonstration in task.demonstrations for frames in demonstration.frames
+        ),
         "samples": int(task.ends[-1]),
-        "scenes": dict(Counter(one.folder.name.rsplit("_", 1)[0] for one in task.demonstrations)),
+        "scenes": dict(
+            Counter(
+                demonstration.folder.name.rsplit("_", 1)[0] for demonstration in task.demonstrations
+            )
+        ),
         "renderer": task.demonstrations[0].info["recipe"]["renderer"],
     }
