@@ -85,11 +85,9 @@ def fit_drive(
         raise InputError(f"{scene_id}: no photograph", do_this)
     recipe = replace(recipe or SplatRecipe.street(), seed=seed)
     train, guesses = prepared_views(views, tell)
-    actors_in_view = {name for view in train for name in view.actors}
-    boxes_in_view = {name: box for name, box in (boxes or {}).items() if name in actors_in_view}
     start = Start(
         _start(train, guesses, points, recipe, scene_id),
-        start_in_boxes(boxes_in_view, recipe.actor_points, scene_id, recipe.seed),
+        start_in_boxes(_boxes_in_view(train, boxes or {}), recipe.actor_points, scene_id, seed),
     )
     model = fit(
         train,
@@ -101,10 +99,24 @@ def fit_drive(
         device=device,
         report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
     )
-    fitted = [replace(view, gain=model.gains[i]) for i, view in enumerate(train)]
+    return FittedDrive(model, _exposures(train, model, kept or {}))
+
+
+def _boxes_in_view(views: Sequence[PosedView], boxes: Mapping[str, Box]) -> dict[str, Box]:
+    """Return the boxes of the road users that at least one view shows."""
+    names = {name for view in views for name in view.actors}
+    return {name: box for name, box in boxes.items() if name in names}
+
+
+def _exposures(
+    views: Sequence[PosedView], model: Reconstruction, kept: Mapping[str, PinholeCamera]
+) -> dict[str, tuple[float, float, float]]:
+    """Return the gains of the fitted photographs, and of those that were kept from the fit the
+    gains of their neighbours.
+    """
+    fitted = [replace(view, gain=model.gains[i]) for i, view in enumerate(views)]
     exposures = {view.name: view.gain for view in fitted}
-    exposures |= {name: _gain_near(fitted, name, camera) for name, camera in (kept or {}).items()}
-    return FittedDrive(model, exposures)
+    return exposures | {name: _gain_near(fitted, name, camera) for name, camera in kept.items()}
 
 
 def prepared_views(

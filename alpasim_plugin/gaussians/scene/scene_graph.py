@@ -86,10 +86,18 @@ class SceneNode:
         if not clouds:
             return np.zeros(3), 0.0
         # A coordinate at a time: numpy is slow along an axis of three.
-        centres = [np.ascontiguousarray(c.means.T) for c in clouds]
-        reach = [3 * np.maximum(np.maximum(*c.scales.T[:2]), c.scales.T[2]) for c in clouds]
-        low = np.min([(m - r).min(axis=1) for m, r in zip(centres, reach, strict=True)], axis=0)
-        high = np.max([(m + r).max(axis=1) for m, r in zip(centres, reach, strict=True)], axis=0)
+        centres = [np.ascontiguousarray(cloud.means.T) for cloud in clouds]
+        reach = [
+            3 * np.maximum(np.maximum(*cloud.scales.T[:2]), cloud.scales.T[2]) for cloud in clouds
+        ]
+        low = np.min(
+            [(centre - radius).min(axis=1) for centre, radius in zip(centres, reach, strict=True)],
+            axis=0,
+        )
+        high = np.max(
+            [(centre + radius).max(axis=1) for centre, radius in zip(centres, reach, strict=True)],
+            axis=0,
+        )
         return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
@@ -304,9 +312,21 @@ class SceneGraph:
         self,
         camera: PinholeCamera,
         actor_poses: Mapping[str, F64],
-        sharp: int,
+        halvings: int,
         background: NodeSet,
     ) -> list[ChosenNode]:
+        """Return the nodes that a camera sees, each with the level whose cells are small enough at
+        its distance.
+
+        Args:
+            camera: From where.
+            actor_poses: Road user -> ``(4, 4)`` pose of its box; those without one are not there.
+            halvings: How often the cells of usual cameras are halved for this one.
+            background: What does not move.
+
+        Raises:
+            RendererError: A pose of a road user that has no model.
+        """
         if camera.rolling is not None:
             camera = camera.widened(camera.rolling.reach_px)
         unknown = sorted(set(actor_poses) - set(self.actors))
@@ -330,9 +350,9 @@ class SceneGraph:
         allowed_m = CELL_PX * np.maximum(distance, 0.0) / max(camera.fx, camera.fy)
         chosen = []
         for i in np.flatnonzero(visible):
-            level = _level(nodes[i], float(allowed_m[i]), sharp)
+            level = _level(nodes[i], float(allowed_m[i]), halvings)
             if level is not None:
-                antialiased = sharp > 0 and nodes[i].is_built
+                antialiased = halvings > 0 and nodes[i].is_built
                 chosen.append(ChosenNode(nodes[i], level, places[i], antialiased))
         return chosen
 
@@ -365,12 +385,12 @@ class _OnDevice(NamedTuple):
     place: Mapping[tuple[str, int], int]
 
 
-def _level(node: SceneNode, allowed_m: float, sharp: int) -> int | None:
+def _level(node: SceneNode, allowed_m: float, halvings: int) -> int | None:
     """Return the coarsest level whose cells are small enough for a camera, else the finest of those
     that the camera may use; None for a node that only sharper cameras see.
     """
-    least_m = node.usual_cell_m / 2**sharp
-    most_m = allowed_m / 2 if sharp and node.is_built else allowed_m
+    least_m = node.usual_cell_m / 2**halvings
+    most_m = allowed_m / 2 if halvings and node.is_built else allowed_m
     level_numbers = [i for i, level in enumerate(node.levels) if level.cell_m >= least_m]
     fit = [i for i in level_numbers if node.levels[i].cell_m <= most_m]
     if fit:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -64,17 +65,16 @@ def finetune_decoder(
         InfrastructureError: The loss is not finite.
     """
     settings = bundle_settings(bundle)
-    tensors = {key: value.float() for key, value in load_weights(bundle).items()}
-    parts = parts_of(tensors)
+    parts = parts_of({key: value.float() for key, value in load_weights(bundle).items()})
     vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
-    net = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
+    generator = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
 
     sequences = PairDataset(data, "train", size).sequences
     clips = LatentClips(sequences, vae, form, out.parent / "latents", _named(prepared, "latents"))
     rollouts = Rollouts(
         clips,
         vae,
-        net,
+        generator,
         settings.block_latents,
         settings.window,
         "drawn" if settings.uses_map else settings.no_map,
@@ -86,22 +86,45 @@ def finetune_decoder(
     vae.to(require_device(device))
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)
-    made: dict[str, dict[str, Tensor]] = {
-        "dit": {key: half(value) for key, value in parts["dit"].items()},
-        "vae": {key: half(value) for key, value in trainer.averaged().items()},
-    }
+
     note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
     path = out / BUNDLE_FILE
-    save_bundle(path, made, settings, trained=True, note=note)
-    about = {"pairs": "rendered scenes, split train", "clips": len(clips), "form": asdict(form)}
+    weights = {"dit": _halves(parts["dit"]), "vae": _halves(trainer.averaged())}
+    save_bundle(path, weights, settings, trained=True, note=note)
+    _write_card(path, note, len(clips), form, schedule, facts)
+    return path
+
+
+def _halves(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors in the precision of a bundle."""
+    return {name: half(tensor) for name, tensor in tensors.items()}
+
+
+def _write_card(
+    path: Path,
+    note: str,
+    n_clips: int,
+    form: ClipForm,
+    schedule: Schedule,
+    facts: Mapping[str, Any],
+) -> None:
+    """Write the model card beside a bundle.
+
+    Args:
+        path: The bundle, in the folder of its run.
+        note: What it is, as in its metadata.
+        n_clips, form: What it was trained on.
+        schedule: How long.
+        facts: What else identifies the run.
+    """
+    about = {"pairs": "rendered scenes, split train", "clips": n_clips, "form": asdict(form)}
     training = {
         "what": "decoder only, on the generator's rollouts",
         "schedule": asdict(schedule),
         **facts,
     }
-    rows, hours = curves(out / LOG_FILE)
+    rows, hours = curves(path.parent / LOG_FILE)
     ModelCard(f"OneFixer weights: {note}", about, training, rows, hours).write(path)
-    return path
 
 
 def _named(

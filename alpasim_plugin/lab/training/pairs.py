@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -87,15 +88,6 @@ def make_sequence(
     if is_made(folder, info):
         return False
     camera = _camera(scenario, recipe.camera)
-    times = range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
-    moving = [a.actor_id for a in scenario.actors if np.ptp(a.track.xyz, axis=0).max() > MOVING_M]
-    lens = {
-        "width": camera.width,
-        "height": camera.height,
-        "K": camera.K.tolist(),
-        "T_rig_camera": camera.T_rig_camera.tolist(),
-    }
-    facts = {**info, "camera": lens, "actors": len(scenario.actors), "moving_actors": len(moving)}
     source = make_renderer(recipe.source, scenario, seed, device, threads=1)
     geometry: list[FrameGeometry] = []
     recorded = [frame for frame in source.recorded() if frame.camera == camera.name]
@@ -107,11 +99,32 @@ def make_sequence(
     write_sequence(
         folder,
         pair_frames(scenario, camera, recipe, seed, source, geometry, device),
-        len(times),
-        facts,
+        len(_times(scenario, recipe)),
+        {**info, **_camera_and_actors(scenario, camera)},
         beside,
     )
     return True
+
+
+def _times(scenario: Scenario, recipe: PairRecipe) -> range:
+    """Return the instants of the frames, microseconds."""
+    return range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
+
+
+def _camera_and_actors(scenario: Scenario, camera: CameraSpec) -> dict[str, Any]:
+    """Return what sequence.json says of the camera and of the road users."""
+    tracks = [actor.track.xyz for actor in scenario.actors]
+    moving = [xyz for xyz in tracks if np.ptp(xyz, axis=0).max() > MOVING_M]
+    return {
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": camera.K.tolist(),
+            "T_rig_camera": camera.T_rig_camera.tolist(),
+        },
+        "actors": len(tracks),
+        "moving_actors": len(moving),
+    }
 
 
 def pair_frames(
@@ -129,7 +142,7 @@ def pair_frames(
     target = make_renderer(recipe.target, scenario, seed, device, threads=1)
     layers = prepare_map(scenario.lane_map)
     offset_m = lateral_offsets(scenario, recipe, seed)
-    for i, t_us in enumerate(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)):
+    for i, t_us in enumerate(_times(scenario, recipe)):
         T_world_camera = offset_from_log(scenario, t_us, float(offset_m[i])) @ camera.T_rig_camera
         actors = log_actors(scenario, t_us)
         request = RenderRequest(t_us, camera, np.stack([T_world_camera, T_world_camera]), actors)
@@ -155,11 +168,9 @@ def lateral_offsets(scenario: Scenario, recipe: PairRecipe, seed: int) -> F64:
     cycle renders, which are degraded there.
     """
     if recipe.offset_m is not None:
-        return np.full(
-            len(range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)), recipe.offset_m
-        )
+        return np.full(len(_times(scenario, recipe)), recipe.offset_m)
     rng = stream(scenario.scene_id, seed, "training.wander")
-    t_s = np.arange(scenario.start_us, scenario.end_us + 1, recipe.interval_us) * 1e-6
+    t_s = np.array(_times(scenario, recipe)) * 1e-6
     on_path = rng.random() < 0.2 or scenario.degradation.kind == "cycle"
     size = 0.0 if on_path else recipe.max_offset_m * np.sqrt(rng.uniform(0.05, 1.0))
     periods_s = rng.uniform([6.0, 12.0], [12.0, 30.0])
