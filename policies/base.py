@@ -76,7 +76,7 @@ def front_camera(scenario: Scenario) -> CameraSpec:
         for camera in scenario.cameras
         if camera.T_rig_camera[0, 2] > 0.7 and camera.lens is None
     ]
-    for camera in sorted(ahead, key=lambda c: "front" not in c.name):
+    for camera in sorted(ahead, key=lambda camera: "front" not in camera.name):
         return camera
     raise InputError(
         f"scene {scenario.scene_id!r}: no pinhole looks ahead among its cameras {', '.join(camera.name for camera in scenario.cameras)}",

@@ -124,9 +124,11 @@ def side_fault(plans: Mapping[str, Sequence[Plan]]) -> str:
     straight on where the image alone or the route alone bends.
     """
     by_m = {"route": _end_m(plans[ROUTE_LEFT.name], plans[STRAIGHT.name])}
-    if {one.name for one in IMAGES} <= plans.keys():
+    if {situation.name for situation in IMAGES} <= plans.keys():
         by_m["image"] = _end_m(plans[IMAGE_LEFT.name], plans[NO_ROUTE.name])
-    mirrored = " and the ".join(what for what, m in by_m.items() if m < -LEAST_M)
+    mirrored = " and the ".join(
+        offset for offset, distance_m in by_m.items() if distance_m < -LEAST_M
+    )
     if mirrored:
         return f"where the {mirrored} alone bends left the plan leads further right: it is read mirrored, or y does not point left"
     left_m, right_m = (_end_m(plans[road.name]) for road in (LEFT, RIGHT))
@@ -141,7 +143,9 @@ def _end_m(plans: Sequence[Plan], others: Sequence[Plan] = ()) -> float:
     """
     ends_m = [float(plan.xy[-1, 1]) for plan in plans[-3:]]
     if others:
-        ends_m = [m - float(plan.xy[-1, 1]) for m, plan in zip(ends_m, others[-3:], strict=True)]
+        ends_m = [
+            end_m - float(plan.xy[-1, 1]) for end_m, plan in zip(ends_m, others[-3:], strict=True)
+        ]
     if min(ends_m) < 0 < max(ends_m):
         return 0.0
     return min(ends_m, key=abs)
@@ -200,7 +204,7 @@ def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[Check]:
     """List legal but unusual properties, by the plans of each situation."""
     out = []
     probes = [("route_rig", STRAIGHT, ROUTE_LEFT)]
-    if {one.name for one in IMAGES} <= plans.keys():
+    if {situation.name for situation in IMAGES} <= plans.keys():
         probes.append(("images", NO_ROUTE, IMAGE_LEFT))
     for source, straight, left in probes:
         late = _late(plans[straight.name], plans[left.name])

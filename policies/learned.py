@@ -71,7 +71,7 @@ class Learned(Policy):
         self.net = load_net(type(self).files[0] if weights is None else Path(weights))
         self.cameras = [view_camera(scenario, view) for view in self.net.views]
         self.sensors: Sequence[SensorSpec] = tuple(
-            SensorSpec(c.name, device=True) for c in self.cameras
+            SensorSpec(camera.name, device=True) for camera in self.cameras
         )
         self.grid_m = path_grid()
         self.weights = knot_weights()

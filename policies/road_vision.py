@@ -178,7 +178,9 @@ class RidgeFilter:
         ).astype(np.intp)
         starts = [0, *(np.flatnonzero(np.diff(sizes, axis=0).any(axis=1)) + 1).tolist(), len(sizes)]
         # Rows of equal windows are neighbours, and a few runs of them make the grid.
-        self._runs = [(slice(a, b), *sizes[a].tolist()) for a, b in itertools.pairwise(starts)]
+        self._runs = [
+            (slice(begin, end), *sizes[begin].tolist()) for begin, end in itertools.pairwise(starts)
+        ]
         _, self._gap, flank = sizes.T
         self._beside = np.maximum(np.rint(flank / 2), 1.0).astype(np.intp)
         inside = grid.inside
@@ -281,7 +283,7 @@ def find_paint(
     inner = (cols > 0) & (cols < smooth.shape[1] - 1)
     rows = rows[inner]
     cols = cols[inner]
-    before, centre, after = (smooth[rows, cols + d].astype(np.float64) for d in (-1, 0, 1))
+    before, centre, after = (smooth[rows, cols + shift].astype(np.float64) for shift in (-1, 0, 1))
     bend = np.maximum(2 * centre - before - after, 1e-6)
     shift = np.minimum(np.maximum(0.5 * (after - before) / bend, -0.5), 0.5)
     y = grid.y_m[cols] - shift * CELL_M

@@ -281,7 +281,9 @@ def _block_means(raster: F64, block: int) -> tuple[F64, F64, F64]:
 def _line(files: SourceFiles, location: str, raw: JsonObject, key: str, origin: F64) -> F64:
     """Return a polyline ``(N, 3)`` minus the origin."""
     with parsing(f"{location}, {key}", "give a list of at least two points with x, y and z"):
-        points = np.array([[p["x"], p["y"], p["z"]] for p in raw[key]], dtype=np.float64)
+        points = np.array(
+            [[point["x"], point["y"], point["z"]] for point in raw[key]], dtype=np.float64
+        )
         if len(points) < 2:
             raise ValueError(f"{len(points)} points")
         return near(location, points - origin)

@@ -167,5 +167,8 @@ def _from_set(draft: SceneDraft, camera_set: CameraSet) -> tuple[CameraSpec, ...
             cameras = _chosen(draft, cameras, camera_set.names)
     if camera_set.width is not None:
         width = camera_set.width
-        cameras = tuple(resized(c, width, round(c.height * width / c.width)) for c in cameras)
+        cameras = tuple(
+            resized(camera, width, round(camera.height * width / camera.width))
+            for camera in cameras
+        )
     return tuple(replace(camera, shutter_us=camera_set.shutter_us) for camera in cameras)

@@ -346,7 +346,7 @@ def number(element: Element, place: str, default: float | None = None) -> float:
 
 
 def _line(element: Element, name: str, least: int) -> F64:
-    points = [point(one) for one in element.findall(f"{name}/point")]
+    points = [point(vertex) for vertex in element.findall(f"{name}/point")]
     if len(points) < least:
         raise ValueError(f"{name} with {len(points)} points, at least {least} are needed")
     return np.array(points, dtype=np.float64)
@@ -446,7 +446,11 @@ def mark_intersections(lanes: dict[str, Lane]) -> dict[str, Lane]:
     marked: dict[str, Lane] = {}
     for n, (key, lane) in enumerate(lanes.items()):
         friends = {key, *lane.successors, *before[key], lane.left_neighbour, lane.right_neighbour}
-        others = [polygons[m] for m in np.sort(tree.query(polygons[n])) if ids[m] not in friends]
+        others = [
+            polygons[number]
+            for number in np.sort(tree.query(polygons[n]))
+            if ids[number] not in friends
+        ]
         crossing = lane.is_intersection or _is_covered(polygons[n], others)
         marked[key] = replace(lane, is_intersection=crossing)
     return marked

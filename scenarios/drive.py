@@ -133,7 +133,7 @@ def _map_document(lane_map: LaneMap) -> JsonObject:
     return {
         "lanes": [_record(lane) for lane in lane_map.lanes.values()],
         **lines,
-        "markings": [_record(one) for one in lane_map.markings],
+        "markings": [_record(marking) for marking in lane_map.markings],
         "signs": [
             {"T_world_sign": pose.tolist(), "box": vars(box)} for pose, box in lane_map.signs
         ],

@@ -57,9 +57,9 @@ def make_ego_path(road: Road, ego: EgoSpec, segments: Sequence[Part]) -> EgoPath
             f"lane {ego.lane}: that lane leaves the main road after {chain[-1][0]} (element {len(chain) - 1})",
             "start in a lane that goes on, or change lanes before",
         )
-    line = np.concatenate([parts[0]] + [p[1:] for p in parts[1:]])
+    line = np.concatenate([parts[0]] + [part[1:] for part in parts[1:]])
     s = arc_lengths(line)
-    begins = s[np.cumsum([0] + [len(p) - 1 for p in parts])]
+    begins = s[np.cumsum([0] + [len(part) - 1 for part in parts])]
     for segment, begin, end in zip(segments, begins, begins[1:], strict=False):
         if isinstance(segment, NarrowGapSegment) and segment.shift_m:
             quarter = (end - begin) / 4
@@ -83,7 +83,7 @@ def _change(
     change: LaneChangeSpec,
     at_m: float,
 ) -> tuple[list[F64], list[tuple[str, int]]]:
-    lengths = np.array([arc_lengths(p)[-1] for p in parts])
+    lengths = np.array([arc_lengths(part)[-1] for part in parts])
     begin = np.concatenate([[0.0], np.cumsum(lengths)])
     first = int(np.searchsorted(begin, at_m, side="right")) - 1
     location = f"lane change at {at_m:.0f} m to lane {change.to_lane}"
@@ -141,7 +141,7 @@ def lane_chain(road: Road, ego_path: EgoPath, lane: int | str, at_s_m: float) ->
     if not ids:
         n = (
             sum(f is not None for f in stretch.forward),
-            sum(b is not None for b in stretch.backward),
+            sum(backward is not None for backward in stretch.backward),
         )
         raise InputError(
             f"lane {lane}: {n[0]} forward and {n[1]} oncoming lanes at {at_s_m:.0f} m",

@@ -162,7 +162,7 @@ def yielding_acceleration(
     low, high = line.stations(0 * row, np.repeat(window[0], n * k), np.repeat(window[1], n * k))
     span = spans(line, 0 * row, everybody, row, low, high)
     half = box.width_m / 2 + SIDE_M
-    rear, front, speed = (a.reshape(n, k) for a in (span.rear, span.front, span.speed))
+    rear, front, speed = (array.reshape(n, k) for array in (span.rear, span.front, span.speed))
     inside = ((span.low < half) & (span.high > -half)).reshape(n, k) & ahead.present
     inside &= (rear > window[0]) & (rear < window[1])
     tau = TIMES_S[:, None]

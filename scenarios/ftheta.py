@@ -248,7 +248,7 @@ def pixel_to_angle(camera: CameraSpec) -> F64:
 
 
 def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
-    coefficients = " ".join(repr(float(c)) for c in pixel_to_angle(camera))
+    coefficients = " ".join(repr(float(coefficient)) for coefficient in pixel_to_angle(camera))
     linear = LensModel.linear if camera.lens is None else camera.lens.linear
     properties = {
         "Model": "ftheta",

@@ -244,7 +244,7 @@ def _actors(draft: SceneDraft, drive: RecordedLog) -> tuple[Actor, ...]:
     """
     log = draft.spec.log
     if log is None:
-        files = {one.id: _appearance(draft, i) for i, one in enumerate(draft.spec.actors)}
+        files = {actor.id: _appearance(draft, i) for i, actor in enumerate(draft.spec.actors)}
         for i, name in enumerate(files):
             if files[name] and name not in {actor.actor_id for actor in drive.actors}:
                 raise draft.document.error(

@@ -119,7 +119,12 @@ def link_notes(lanes: Mapping[str, Lane]) -> tuple[str, ...]:
     if not gaps:
         return ()
     widest_first = sorted(gaps, key=lambda link: (-gaps[link], link))
-    listed = some_of([f"{a} to {b} ({gaps[a, b]:.2f} m)" for a, b in widest_first])
+    listed = some_of(
+        [
+            f"{lane_id} to {other_id} ({gaps[lane_id, other_id]:.2f} m)"
+            for lane_id, other_id in widest_first
+        ]
+    )
     return (f"{len(gaps)} links join lanes that lie more than {MEET_M:g} m apart: {listed}",)
 
 
@@ -212,7 +217,7 @@ def rails(lane: Lane) -> tuple[F64, F64]:
 
 
 def _at(wanted: F64, shares: F64, line: F64) -> F64:
-    return np.column_stack([np.interp(wanted, shares, line[:, d]) for d in range(3)])
+    return np.column_stack([np.interp(wanted, shares, line[:, axis]) for axis in range(3)])
 
 
 def _shares(line: F64) -> F64:
@@ -240,12 +245,12 @@ def merge_areas(areas: Sequence[Any]) -> Any:
     Closing is a mitred offset outwards and back, which moves no straight border.
     """
     half = SEAM_M / 2
-    merged = shapely.union_all([shapely.make_valid(a) for a in areas])
+    merged = shapely.union_all([shapely.make_valid(area) for area in areas])
     closed = shapely.buffer(merged, half, join_style="mitre", mitre_limit=2.0)
     closed = shapely.union_all(
         [merged, shapely.buffer(closed, -half, join_style="mitre", mitre_limit=2.0)]
     )
-    parts = [p for p in shapely.get_parts(closed) if shapely.get_type_id(p) == 3]
+    parts = [part for part in shapely.get_parts(closed) if shapely.get_type_id(part) == 3]
     filled = [
         shapely.Polygon(
             p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= MIN_HOLE_M2]

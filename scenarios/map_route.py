@@ -47,7 +47,9 @@ class LaneGraph:
         self.lanes = {
             key: lane for key, lane in lanes.items() if lane.kind == "vehicle" and _is_even(lane)
         }
-        self.length_m = {k: float(arc_lengths(v.centre)[-1]) for k, v in self.lanes.items()}
+        self.length_m = {
+            lane_id: float(arc_lengths(lane.centre)[-1]) for lane_id, lane in self.lanes.items()
+        }
 
     def following(self, lane_id: str) -> tuple[str, ...]:
         """Return the lanes that follow a lane."""

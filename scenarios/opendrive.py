@@ -333,7 +333,7 @@ def read_lanes(
                 continue
             with parsing(f"{place}, section {index}", "repair its numbers"):
                 section_lanes = _section(road, index, section, T_local_map, left_out, changing)
-            lanes.update({one.lane_id: one for one in section_lanes})
+            lanes.update({lane.lane_id: lane for lane in section_lanes})
         missing = road.length_m - _end_m(road)
         if missing > MAX_MISSING_M:
             raise InputError(
@@ -407,10 +407,10 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
 
 
 def _signs_by_type(odr: OdrMap) -> tuple[str, ...]:
-    signals = [one for road in odr.roads for one in road.signals]
+    signals = [signal for road in odr.roads for signal in road.signals]
     if not signals:
         return ()
-    signs = Counter(one.kind for one in signals if not one.dynamic)
+    signs = Counter(signal.kind for signal in signals if not signal.dynamic)
     listed = ", ".join(f"{kind} ({n})" for kind, n in sorted(signs.items()))
     return (
         f"{signs.total()} signs by type: {listed or 'none'}; "
@@ -512,7 +512,7 @@ def _stations(road: Road, section: Section) -> F64:
     cubics = np.concatenate([road.lane_offset, *lines])
     curved = any(record.kind != "line" for record in road.records)
     starts = [*(record.s_m for record in road.records), *cubics[:, 0], *road.elevation[:, 0]]
-    inside = [at for at in starts if section.s_m < at < section.end_m]
+    inside = [start_m for start_m in starts if section.s_m < start_m < section.end_m]
     knots = np.unique([section.s_m, *inside, section.end_m])
     bends = curved or cubics[:, 2:].any() or len(road.elevation) > 1
     step = STEP_M if bends else STRAIGHT_STEP_M
@@ -540,8 +540,8 @@ def _divided(knots: F64, parts: F64) -> F64:
     """
     pieces = np.maximum(np.ceil(parts - 1e-9).astype(np.int64), 1)
     divided = [
-        np.linspace(a, b, n, endpoint=False)
-        for a, b, n in zip(knots[:-1], knots[1:], pieces, strict=True)
+        np.linspace(begin, end, n, endpoint=False)
+        for begin, end, n in zip(knots[:-1], knots[1:], pieces, strict=True)
     ]
     return np.concatenate([*divided, knots[-1:]])
 

@@ -105,7 +105,7 @@ def reference_line(records: Sequence[Geometry], s_m: F64) -> F64:
     """Return ``(N, 3)`` x, y and heading (not wrapped) of a road's reference line at arc lengths
     ``(N,)``.
     """
-    starts = np.array([one.s_m for one in records])
+    starts = np.array([record.s_m for record in records])
     owner = np.clip(np.searchsorted(starts, s_m, side="right") - 1, 0, len(records) - 1)
     out = np.empty((len(s_m), 3))
     for i in np.unique(owner):

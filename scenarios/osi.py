@@ -459,7 +459,7 @@ def _links(facts: Any) -> tuple[list[str], list[str | None]]:
 
 def _edge(lane_borders: Sequence[Any], centre: F64, origin: F64) -> F64 | None:
     """Join the boundaries of one side of a lane along its centre ``(N, 3)``; None for no line."""
-    points = [_points(p.position for p in border.boundary_line) for border in lane_borders]
+    points = [_points(point.position for point in border.boundary_line) for border in lane_borders]
     border_points = np.concatenate([np.zeros((0, 3)), *points]) - origin
     s_m = np.array([project(centre, point)[0] for point in border_points])
     line = border_points[np.argsort(s_m, kind="stable")]
@@ -469,7 +469,9 @@ def _edge(lane_borders: Sequence[Any], centre: F64, origin: F64) -> F64 | None:
 
 
 def _points(vectors: Any) -> F64:
-    return np.array([(one.x, one.y, one.z) for one in vectors], dtype=np.float64).reshape(-1, 3)
+    return np.array(
+        [(vector.x, vector.y, vector.z) for vector in vectors], dtype=np.float64
+    ).reshape(-1, 3)
 
 
 def _mark_type(border: Any) -> LaneMarkType:

@@ -181,7 +181,7 @@ def _in_mcap(data: bytes, path: Path) -> list[bytes]:
             for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages()
         ]
     topics = sorted({(name, topic) for name, topic, _ in listed})
-    read = [one for one in topics if one[0] in MCAP_SCHEMAS]
+    read = [topic for topic in topics if topic[0] in MCAP_SCHEMAS]
     if len(read) != 1:
         channels = ", ".join(f"{topic} ({name})" for name, topic in topics) or "no messages"
         raise InputError(

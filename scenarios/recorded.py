@@ -150,7 +150,7 @@ class SourceFiles:
             raise InputError(
                 f"{path}: column {nulls!r} with empty values", "repair or drop these rows"
             )
-        return {c: table.column(c).to_numpy(zero_copy_only=False) for c in columns}
+        return {column: table.column(column).to_numpy(zero_copy_only=False) for column in columns}
 
     def read_xml(self, path: Path) -> ElementTree.Element:
         """Parse an XML document; a DOCTYPE is refused, so no entity can be defined or expanded.

@@ -322,8 +322,8 @@ class LoggedActor(_Walker):
 
     @model_validator(mode="after")
     def _ordered(self) -> LoggedActor:
-        times = [p[0] for p in self.points]
-        if any(b - a < 1e-6 for a, b in itertools.pairwise(times)):
+        times = [point[0] for point in self.points]
+        if any(end - start < 1e-6 for start, end in itertools.pairwise(times)):
             raise ValueError(
                 "the times of points do not increase | order the rows by time, each time once"
             )
@@ -356,8 +356,8 @@ class DriveActor(_InLane):
 
     @model_validator(mode="after")
     def _ordered(self) -> DriveActor:
-        times = [p[0] for p in self.speeds]
-        if any(b <= a for a, b in itertools.pairwise(times)):
+        times = [point[0] for point in self.speeds]
+        if any(end <= start for start, end in itertools.pairwise(times)):
             raise ValueError(
                 "the times of speeds do not increase | order the rows by time, each time once"
             )

@@ -174,7 +174,7 @@ def import_advice(path: Path) -> str | None:
     if path.suffix.lower() in FILMS:
         return "find the film's poses with COLMAP, then simrun import drive (docs/real-drives.md)"
     places = [path / name for name in DRIVES]
-    if path.name == DRIVES[0] or any(os.path.exists(one) for one in places):
+    if path.name == DRIVES[0] or any(os.path.exists(place) for place in places):
         return f"make one: simrun import drive {path} {out}"
     unread = unread_form(path)
     return None if unread is None else f"{unread[0]} is not read: {unread[1]}"

@@ -94,11 +94,11 @@ def unknown(text: str, kind: str, names: Mapping[str, Path]) -> InputError:
             return InputError(f"{text}: a {part}, not a {kind}", f"Write {option} {text}.")
     name = text.removesuffix(".yaml")
     files = [path.name for path in Path().glob("*.y*ml")]
-    by_last = {known.rsplit("/", 1)[-1]: known for known in names}
+    by_last = {suite.rsplit("/", 1)[-1]: suite for suite in names}
     last = difflib.get_close_matches(name.rsplit("/", 1)[-1], by_last, 3, 0.6)
     near = (
         difflib.get_close_matches(name, list(names), 3, 0.5)
-        or [by_last[one] for one in last]
+        or [by_last[name] for name in last]
         or difflib.get_close_matches(text, files, cutoff=0.8)
     )
     hint = f"did you mean {' or '.join(near)}? " if near else ""
@@ -165,7 +165,9 @@ def expand(
     """
     if source is not None:
         return [ScenarioRef(item, None, tuple(overrides), source)]
-    return [ScenarioRef(r.path, r.seed, (*r.overrides, *overrides)) for r in load_suite(item)]
+    return [
+        ScenarioRef(ref.path, ref.seed, (*ref.overrides, *overrides)) for ref in load_suite(item)
+    ]
 
 
 def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRef]:
@@ -193,9 +195,9 @@ def _expand(text: str, base: Path | None, opened: list[Path]) -> list[ScenarioRe
             raise InputError(f"{mark}: {e.message}", e.hint) from e
         extra = tuple(f"{key}={json.dumps(value)}" for key, value in item.set.items())
         out += [
-            ScenarioRef(r.path, seed, (*r.overrides, *extra))
-            for r in refs
-            for seed in (item.seeds or (r.seed,))
+            ScenarioRef(ref.path, seed, (*ref.overrides, *extra))
+            for ref in refs
+            for seed in (item.seeds or (ref.seed,))
         ]
     return out
 

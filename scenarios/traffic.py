@@ -233,7 +233,7 @@ def _outer_edge(road: Road, ego_path: EgoPath, at_s_m: float, side: str) -> tupl
     """
     stretch = road.stretches[ego_path.stretch_at(at_s_m)]
     xyz, yaw = ego_path.path.at(at_s_m)
-    oncoming = [b for b in stretch.backward if b is not None]
+    oncoming = [backward for backward in stretch.backward if backward is not None]
     forward = [f for f in stretch.forward if f is not None]
     lane = road.lane_map.lanes[
         forward[-1] if side == "right" else (oncoming[-1] if oncoming else forward[0])

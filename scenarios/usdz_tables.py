@@ -92,7 +92,7 @@ def _rows(archive: Archive, folder: str, table: str) -> list[Row]:
 def _read(archive: Archive, folder: str, rows: list[Row]) -> LaneMap:
     links: dict[tuple[str, str], tuple[str, ...]] = {}  # of several rows the first counts
     for key, row in _rows(archive, folder, "association"):
-        objects = tuple(str(one) for one in row.get("objects") or ())
+        objects = tuple(str(key) for key in row.get("objects") or ())
         links.setdefault((str(key.get("kind")), str(row.get("subjects"))), objects)
     rails_of = _rails(archive, folder, rows)
     lanes = {}
@@ -152,7 +152,9 @@ def _beside_lanes(archive: Archive, folder: str) -> LaneMap:
 
 def points(raw: Any) -> F64:
     """Return points ``(N, 3)`` of a list of structs or of a struct of lists."""
-    columns = [raw[axis] if isinstance(raw, dict) else [p[axis] for p in raw] for axis in "xyz"]
+    columns = [
+        raw[axis] if isinstance(raw, dict) else [point[axis] for point in raw] for axis in "xyz"
+    ]
     xyz = np.array(columns, dtype=np.float64).T
     if not np.ptp(xyz, axis=0).max(initial=0.0) <= MAX_REACH_M:
         raise ValueError("points that are not finite or kilometres apart")

@@ -209,8 +209,8 @@ def ground_mesh(scenario: Scenario) -> bytes:
         scenario.ego_log.xyz[:, :2],
         *(lane.centre[:, :2] for lane in scenario.lane_map.lanes.values()),
     ]
-    low = np.min([p.min(axis=0) for p in points], axis=0) - GROUND_MARGIN_M
-    high = np.max([p.max(axis=0) for p in points], axis=0) + GROUND_MARGIN_M
+    low = np.min([xyz.min(axis=0) for xyz in points], axis=0) - GROUND_MARGIN_M
+    high = np.max([xyz.max(axis=0) for xyz in points], axis=0) + GROUND_MARGIN_M
     ground = scenario.ground
     flat = float(np.ptp(ground.z)) == 0.0
     size = np.maximum(high - low, 1.0)
@@ -219,7 +219,9 @@ def ground_mesh(scenario: Scenario) -> bytes:
         if flat
         else max(ground.cell_m, float(np.sqrt(size[0] * size[1] / GROUND_NODES)))
     )
-    xs, ys = (low[d] + step * np.arange(int(np.ceil(size[d] / step)) + 1) for d in range(2))
+    xs, ys = (
+        low[axis] + step * np.arange(int(np.ceil(size[axis] / step)) + 1) for axis in range(2)
+    )
     xy = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
     vertices = np.column_stack([xy, height_at(ground, xy)]).astype("<f4")
     corner = (np.arange(len(ys) - 1)[:, None] * len(xs) + np.arange(len(xs) - 1)).ravel()

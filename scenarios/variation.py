@@ -156,7 +156,7 @@ def _jitter(spec: ScenarioSpec, scene_id: str, fixed: Collection[str]) -> Scenar
             return part.model_copy(update={k: walk(getattr(part, k), (*loc, k)) for k in names})
         if isinstance(part, tuple) and part and isinstance(part[0], Part):
             # Actors are named by their ids, so that the order of the list does not matter.
-            return tuple(walk(one, (*loc, getattr(one, "id", i))) for i, one in enumerate(part))
+            return tuple(walk(item, (*loc, getattr(item, "id", i))) for i, item in enumerate(part))
         kind = JITTERED.get(str(loc[-1]))
         if kind is None or part is None or ".".join(map(str, loc)) in touched:
             return part

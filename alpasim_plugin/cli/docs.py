@@ -53,7 +53,7 @@ def docs(
     name = _name_of(page, list(texts))
     if name not in texts:
         near = difflib.get_close_matches(name, texts, 1)
-        near = near or [one for one, title in titles.items() if name.lower() in title.lower()]
+        near = near or [page for page, title in titles.items() if name.lower() in title.lower()]
         guess = f"did you mean {' or '.join(map(repr, near[:3]))}? " if near else ""
         raise InputError(
             f"{page}: no such page among {len(texts)}", f"{guess}simrun docs lists all"

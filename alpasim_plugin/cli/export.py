@@ -139,7 +139,7 @@ def export_recording(items: Sequence[str], selection: Wanted, path: Path) -> dic
     check_wanted(run, wanted)
     cells = cells_of(run, wanted)
     if len(cells) != 1:
-        names = "; ".join(one.name for one in cells[:SHOWN_CELLS])
+        names = "; ".join(cell.name for cell in cells[:SHOWN_CELLS])
         raise InputError(
             f"{root}: {len(cells)} finished rollouts of scene, policy and seed: {names}",
             "Choose one by --scene, --policy and --seed, or name a rollout's folder.",

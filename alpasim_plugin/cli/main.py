@@ -173,7 +173,7 @@ class Verb(TyperCommand):
                 "Leave it out, or name what is meant ('.' for this folder); a variable of the shell may not be set.",
             )
         # Of an option that takes one value and stands twice, the last would win.
-        options = [one for one in command.params if isinstance(one, TyperOption)]
+        options = [option for option in command.params if isinstance(option, TyperOption)]
         for option in options:
             words = [word for word in args if word.partition("=")[0] in option.opts]
             if len(words) > 1 and not option.multiple and not option.is_flag:
@@ -516,7 +516,7 @@ def _leave_threads_behind(code: int) -> None:
     """End the process where a part has started a thread that is no daemon: Python would wait for it
     without end.
     """
-    others = [one for one in threading.enumerate() if one is not threading.main_thread()]
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     until_s = time.monotonic() + THREADS_S
     for thread in others:
         if not thread.daemon:

@@ -123,7 +123,7 @@ def load_map(name: str, dbc: str | None = None) -> tuple[CanMap, Path]:
     shipped = FOLDER / f"{name}.yaml"
     path = shipped if os.path.isfile(shipped) else Path(name)
     if not os.path.isfile(path):
-        map_names = ", ".join(sorted(p.stem for p in FOLDER.glob("*.yaml")))
+        map_names = ", ".join(sorted(path.stem for path in FOLDER.glob("*.yaml")))
         raise InputError(
             f"map={name}: no such map or file", f"known: {map_names}; or name a YAML file"
         )

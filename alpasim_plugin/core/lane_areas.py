@@ -39,9 +39,11 @@ def lane_polygon(
         line = shapely.linestrings(xy) if len(xy) > 1 else shapely.points(xy[0])
         return shapely.buffer(line, half_width_m, quad_segs=16)
     edges = lane.left, lane.right
-    if not even_odd and all(len(e) > 3 and np.allclose(e[0], e[-1], 0, 1e-6) for e in edges):
+    if not even_odd and all(
+        len(edge) > 3 and np.allclose(edge[0], edge[-1], 0, 1e-6) for edge in edges
+    ):
         # A lane that leads into itself: what lies between its two closed edges.
-        return shapely.symmetric_difference(*(ring_area(e - origin) for e in edges))
+        return shapely.symmetric_difference(*(ring_area(edge - origin) for edge in edges))
     ring = np.concatenate([lane.left[:, :2], lane.right[::-1, :2]])
     return ring_area(ring - origin[:2], even_odd)
 
@@ -69,9 +71,9 @@ def ring_area(ring: F64, even_odd: bool = False) -> Any:
 def areal_parts(shape: Any) -> Any:
     """Keep the polygons of any shapely geometry and drop its lines and points."""
     parts = [
-        p
-        for p in shapely.get_parts(shapely.get_parts(shape))
-        if shapely.get_dimensions(p) == 2 and not shapely.is_empty(p)
+        part
+        for part in shapely.get_parts(shapely.get_parts(shape))
+        if shapely.get_dimensions(part) == 2 and not shapely.is_empty(part)
     ]
     if not parts:
         return shapely.Polygon()

@@ -157,5 +157,5 @@ def ends_with_path(rig_xy: F64, scene: PathOfScene) -> bool:
     the end of the path: a rollout ends there.
     """
     end = PathEnd(scene)
-    passed = [end.ends_rollout(at) for at in rig_xy]
+    passed = [end.ends_rollout(xy) for xy in rig_xy]
     return bool(passed) and passed[-1] and not any(passed[:-1])

@@ -56,7 +56,7 @@ def unit_guess(ratio: float) -> str:
 def sensors_problem(sensors: Any) -> str:
     """Say why ``sensors`` of a policy is not a sequence of `SensorSpec`; empty if it is one."""
     if isinstance(sensors, Sequence) and all(isinstance(sensor, SensorSpec) for sensor in sensors):
-        odd = next((one for one in sensors if not isinstance(one.camera, str)), None)
+        odd = next((sensor for sensor in sensors if not isinstance(sensor.camera, str)), None)
         kind = "" if odd is None else type(odd.camera).__name__
         return f"SensorSpec of a {kind}, not of a camera's name such as 'front'" if kind else ""
     return f"sensors is {sensors!r:.80}, not a tuple of SensorSpec (alpasim_plugin.core.types)"

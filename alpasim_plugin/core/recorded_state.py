@@ -37,7 +37,8 @@ def ego_states_from_log(
     # A window of no length, as in a log of one pose, has no motion; one that ends at t has no
     # acceleration.
     span_s, first_s, second_s = (
-        np.where(us > 0, us, 1) * 1e-6 for us in (after - before, t - before, after - t)
+        np.where(span_us > 0, span_us, 1) * 1e-6
+        for span_us in (after - before, t - before, after - t)
     )
     speed = _along(xyz[:, 2] - xyz[:, 0], forward) / span_s
     yaw = heading_of(poses[:, :, :2, 0])

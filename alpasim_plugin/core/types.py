@@ -347,7 +347,9 @@ class RecordedFrame:
 
 def read_only(record: RecordT) -> RecordT:
     """Return a record whose arrays are views that cannot be written, for code that is not ours."""
-    views = {name: one.view() for name, one in vars(record).items() if isinstance(one, np.ndarray)}
+    views = {
+        name: array.view() for name, array in vars(record).items() if isinstance(array, np.ndarray)
+    }
     for view in views.values():
         view.flags.writeable = False
     copy = object.__new__(type(record))
@@ -368,10 +370,10 @@ def shielded(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return type(value)(map(shielded, value))
     if isinstance(value, dict):
-        return {key: shielded(one) for key, one in value.items()}
+        return {key: shielded(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         copy = object.__new__(type(value))
-        vars(copy).update({name: shielded(one) for name, one in vars(value).items()})
+        vars(copy).update({name: shielded(item) for name, item in vars(value).items()})
         return copy
     return value
 

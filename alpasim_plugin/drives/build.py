@@ -467,5 +467,8 @@ def _name_of(drive: SourceDrive, camera: str) -> str:
 
 def scene_id_of(drive: SourceDrive) -> str:
     """Return a name that a scenario may have."""
-    letters = "".join(c if c.isalnum() or c in "_.-" else "-" for c in drive.scene_id).strip("-_.")
+    letters = "".join(
+        character if character.isalnum() or character in "_.-" else "-"
+        for character in drive.scene_id
+    ).strip("-_.")
     return letters[:80] or "drive"

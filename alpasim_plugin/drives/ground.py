@@ -162,7 +162,7 @@ def fit_ground(points: Points, path: F64) -> GroundStrip | None:
     error = h[near] - fitted.value(s[near], left[near], coefficients)
     under = (np.abs(left[near]) < WHEELS) & (spread[near] < 0.03) & (np.abs(error) < LOOSE)
     section = np.floor(s[near] / SECTION).astype(np.int64)
-    groups = [error[under & (section == one)] for one in np.unique(section[under])]
+    groups = [error[under & (section == number)] for number in np.unique(section[under])]
     errors = np.array([np.median(group) for group in groups if len(group) >= 8])
     below, tilt, _ = np.split(coefficients, np.cumsum([len(fitted.knots), len(fitted.tilt_knots)]))
     depths = np.interp(PathFrame(path, height).place(path)[0] / height, fitted.knots, below)

@@ -37,7 +37,11 @@ def fitted_part(drive: SourceDrive, stride: int) -> SourceDrive:
     kept = []
     for camera in drive.cameras:
         held = held_out(drive, camera, stride)
-        kept += [one for one, is_held in zip(drive.of(camera), held, strict=True) if not is_held]
+        kept += [
+            photograph
+            for photograph, is_held in zip(drive.of(camera), held, strict=True)
+            if not is_held
+        ]
     return replace(drive, photographs=tuple(kept))
 
 

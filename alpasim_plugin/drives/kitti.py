@@ -164,7 +164,7 @@ def _table(path: Path, columns: int, do_this: str) -> F64:
 
 def _poses(folder: Path) -> list[F64]:
     places = (folder / "poses.txt", folder.parent.parent / "poses" / f"{real(folder).name}.txt")
-    path = next((one for one in places if os.path.isfile(one)), None)
+    path = next((place for place in places if os.path.isfile(place)), None)
     if path is None:
         raise InputError(f"{folder}: no poses.txt", "put the poses of the left camera beside it")
     table = _table(path, 12, ROW_OF_12)

@@ -78,7 +78,9 @@ def _transforms(folder: Path, need_files: bool) -> SourceDrive:
     files = {photograph.file for photograph in existing}
     in_axes, axes_notes = _in_opencv_axes(folder, document, listed, existing)
     with_cameras = _with_cameras(folder, in_axes)
-    names = sorted({str(each.camera) for each in with_cameras if each.file in files})
+    names = sorted(
+        {str(photograph.camera) for photograph in with_cameras if photograph.file in files}
+    )
     with_times, time_notes = _with_times(with_cameras, names)
     photographs = [photograph for photograph in with_times if photograph.file in files]
     photographs.sort(key=lambda photograph: (str(photograph.camera), int(photograph.t_us or 0)))
@@ -198,7 +200,9 @@ def _with_times(
     columns = []
     notes: list[str] = []
     for camera in cameras:
-        column, order_note = in_order([each for each in photographs if each.camera == camera])
+        column, order_note = in_order(
+            [photograph for photograph in photographs if photograph.camera == camera]
+        )
         columns.append(column)
         notes.append(order_note)
     return timed(columns), notes
@@ -206,7 +210,11 @@ def _with_times(
 
 def _never_fitted(photographs: Sequence[PosedPhotograph]) -> tuple[str, ...]:
     """Return the cameras that the file holds out of the fit."""
-    cameras = (str(each.camera) for each in photographs if each.more.get("use") == "never-fitted")
+    cameras = (
+        str(photograph.camera)
+        for photograph in photographs
+        if photograph.more.get("use") == "never-fitted"
+    )
     return tuple(dict.fromkeys(cameras))
 
 

@@ -81,7 +81,7 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
     T = np.diag([scale, scale, scale, 1.0]) @ T
     moved = points.moved(T)
     poses = {
-        name: np.array([_moved(T, one.T_world_camera) for one in drive.of(name)])
+        name: np.array([_moved(T, photograph.T_world_camera) for photograph in drive.of(name)])
         for name in drive.cameras
     }
     strip = fit_ground(moved, poses[drive.front][:, :3, 3])
@@ -120,7 +120,7 @@ def place(drive: SourceDrive, points: Points, camera_height_m: float | None = No
         ego,
         mounts,
         poses,
-        tuple(replace(one, track=_moved_track(T, one.track)) for one in drive.actors),
+        tuple(replace(actor, track=_moved_track(T, actor.track)) for actor in drive.actors),
         {"up": found_up, "scale": scale_note, "ground": _ground_facts(strip)},
         tuple(notes),
     )
@@ -138,7 +138,7 @@ def check_motion(drive: SourceDrive, placed: PlacedDrive) -> None:
         return
     centres = placed.poses[drive.front][:, :3, 3]
     photographs = drive.of(drive.front)
-    dt_s = np.diff([int(one.t_us or 0) for one in photographs]) * 1e-6
+    dt_s = np.diff([int(photograph.t_us or 0) for photograph in photographs]) * 1e-6
     velocity = np.diff(centres, axis=0) / dt_s[:, None]
     speed = np.linalg.norm(velocity, axis=1)
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
@@ -168,7 +168,7 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
     """Return the transform that puts the drive's up along z and its first heading along x, the
     ground, and how up was determined.
     """
-    front = np.array([one.T_world_camera for one in drive.of(drive.front)])
+    front = np.array([photograph.T_world_camera for photograph in drive.of(drive.front)])
     T = _upright(-front[:, :3, 1].mean(axis=0), front)
     strip = None
     for _ in range(3):
@@ -179,7 +179,7 @@ def _levelled(drive: SourceDrive, points: Points) -> tuple[F64, GroundStrip | No
         line = strip.frame.line[on_path]
         along = strip.frame.along[on_path]
         left = left_of(along)
-        xy = np.concatenate([line[:, :2] + d * strip.height * left for d in (-1.0, 1.0)])
+        xy = np.concatenate([line[:, :2] + side * strip.height * left for side in (-1.0, 1.0)])
         A = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
         slope = np.linalg.lstsq(A, strip.z(xy), rcond=None)[0]
         normal = np.array([-slope[0], -slope[1], 1.0])
@@ -278,12 +278,12 @@ def _rig(
     if drive.front_xy_m is not None:
         mount[:2, 3] = drive.front_xy_m
     ego = trajectory_from_poses(
-        np.array([int(one.t_us or 0) for one in photographs]),
+        np.array([int(photograph.t_us or 0) for photograph in photographs]),
         np.array([pose @ inverse(mount) for pose in front]),
     )
     mounts = {drive.front: mount}
     for name in drive.cameras[1:]:
-        times = [int(one.t_us or 0) for one in drive.of(name)]
+        times = [int(photograph.t_us or 0) for photograph in drive.of(name)]
         common = [i for i, t in enumerate(times) if ego.t_us[0] <= t <= ego.t_us[-1]]
         if common:
             i = common[len(common) // 2]

@@ -127,7 +127,8 @@ def _matched(views: Sequence[PosedView]) -> Tracks:
     if not pairs:
         return Tracks(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 2)), 0)
     ends = np.array(
-        [[m.first, *m.at_first] for m in pairs] + [[m.second, *m.at_second] for m in pairs]
+        [[match.first, *match.at_first] for match in pairs]
+        + [[match.second, *match.at_second] for match in pairs]
     )
     features, number = np.unique(ends, axis=0, return_inverse=True)
     number = number.ravel()
@@ -166,13 +167,15 @@ def agreeing(first: PosedPhotograph, second: PosedPhotograph, turns: Sequence[F6
     n = len(pairs)
     if not n:
         return [0 for _ in turns]
-    pixels = np.array([[m.at_first, m.at_second] for m in pairs]).reshape(-1, 2)
+    pixels = np.array([[match.at_first, match.at_second] for match in pairs]).reshape(-1, 2)
     tracks = Tracks(np.tile([0, 1], n), np.repeat(np.arange(n), 2), pixels, n)
     counts = []
     for turn in turns:
         turned = [
-            PinholeCamera(c.width, c.height, c.K, inverse(turn) @ c.T_camera_world)
-            for c in (view.camera for view in views)
+            PinholeCamera(
+                camera.width, camera.height, camera.K, inverse(turn) @ camera.T_camera_world
+            )
+            for camera in (view.camera for view in views)
         ]
         error = place(tracks, turned).error_px.reshape(-1, 2)
         counts.append(int((error < ERROR_PX).all(axis=1).sum()))
@@ -231,12 +234,12 @@ def _tracked(i: int, shots: Sequence[tuple[PinholeCamera, U8]], strip: GroundStr
     masks = [_mask(camera, piece) for piece in pieces]
     masks[1] = masks[1] & ~masks[0]
     corners = [
-        cv2.goodFeaturesToTrack(image, n, CORNER_CONTRAST, APART_PX, mask=m)
-        for n, m in zip(CORNERS, masks, strict=True)
-        if m.any()
+        cv2.goodFeaturesToTrack(image, n, CORNER_CONTRAST, APART_PX, mask=mask)
+        for n, mask in zip(CORNERS, masks, strict=True)
+        if mask.any()
     ]
     corners_px = np.concatenate(
-        [np.zeros((0, 2)), *(one.reshape(-1, 2) for one in corners if one is not None)]
+        [np.zeros((0, 2)), *(points.reshape(-1, 2) for points in corners if points is not None)]
     ).astype(np.float32)
     if not len(corners_px):
         return np.zeros((0, 4))

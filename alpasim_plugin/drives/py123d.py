@@ -314,7 +314,9 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
     tracks: dict[str, list[list[float]]] = {}
     with parsing(path, DO_THIS):
         kind = str(facts["box_detection_label_class"]).rpartition(".")[2]
-        for t_us, boxes, tokens, labels in zip(*(one.to_pylist() for one in columns), strict=True):
+        for t_us, boxes, tokens, labels in zip(
+            *(column.to_pylist() for column in columns), strict=True
+        ):
             for box, token, label in zip(boxes, tokens, labels, strict=True):
                 tracks.setdefault(str(token), []).append([t_us, *box, label])
         if kind not in CLASSES:
@@ -335,7 +337,7 @@ def _actors(folder: Path, notes: list[str]) -> tuple[Actor, ...]:
                 BODY_M.check(side_m, location)
             box = Box(length_m, width_m, height_m)
             actors += actors_of_track(token, LABELS[letter], box, track)
-    moving = tuple(one for one in actors if not one.is_static and len(one.track) > 1)
+    moving = tuple(actor for actor in actors if not actor.is_static and len(actor.track) > 1)
     notes.append(
         f"{len(moving)} road users move; boxes of {len(actors) - len(moving)} are not used"
     )

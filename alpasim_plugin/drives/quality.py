@@ -145,7 +145,7 @@ def write_page(
             data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
             write_bytes(folder / name, data)
             examples.append((use, rows[i], name))
-    spread = [one.uncertainty_m for one in standing.obstacles]
+    spread = [obstacle.uncertainty_m for obstacle in standing.obstacles]
     quality = {
         "source": drive.kind,
         "photographs": {use: len(rows) for use, rows in comparisons.items()},

@@ -297,5 +297,5 @@ def in_order(photographs: Sequence[PosedPhotograph]) -> tuple[list[PosedPhotogra
 
 
 def _length(photographs: Sequence[PosedPhotograph]) -> float:
-    centres = np.array([one.T_world_camera[:3, 3] for one in photographs])
+    centres = np.array([photograph.T_world_camera[:3, 3] for photograph in photographs])
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())

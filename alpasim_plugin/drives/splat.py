@@ -177,7 +177,9 @@ def _in_frame(
         InputError: The poses see too little of the model.
     """
     folders = (file.parent, poses if os.path.isdir(poses) else poses.parent)
-    stated = next((one / TRAINED for one in folders if os.path.isfile(one / TRAINED)), None)
+    stated = next(
+        (folder / TRAINED for folder in folders if os.path.isfile(folder / TRAINED)), None
+    )
     frames = {"as it is": np.eye(4)}
     if stated is not None:
         frames |= _T_trained_source(stated, drive)

@@ -198,7 +198,11 @@ def check_steps(steps: tuple[float, ...]) -> None:
     Raises:
         ValueError: With what to write, as pydantic's validators report it.
     """
-    if any(b >= a for a, b in pairwise(steps)) or steps[0] != 1000 or steps[-1] <= 0:
+    if (
+        any(later >= earlier for earlier, later in pairwise(steps))
+        or steps[0] != 1000
+        or steps[-1] <= 0
+    ):
         raise ValueError(
             f"steps = {list(steps)} | give named steps falling from 1000, such as [1000] or [1000, 500]"
         )

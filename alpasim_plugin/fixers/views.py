@@ -50,8 +50,9 @@ class Views:
             return False
         pairs = [(getattr(self, part.name), getattr(other, part.name)) for part in fields(self)]
         return all(
-            (a is None) == (b is None) and np.array_equal(np.asarray(a), np.asarray(b))
-            for a, b in pairs
+            (first is None) == (second is None)
+            and np.array_equal(np.asarray(first), np.asarray(second))
+            for first, second in pairs
         )
 
 
@@ -203,7 +204,7 @@ def _stack(
 ) -> Views:
     names = tuple(sorted(cameras))
     order = tuple(tuple(index[name]) for name in names)
-    flat = [i for mine in order for i in mine]
+    flat = [i for indices in order for i in indices]
     frames = [block[i] for i in flat]
     shape = (*frames[0].size, 3)
     lead = (len(names), len(order[0]))
@@ -226,7 +227,7 @@ def _stack(
     return Views(
         names,
         order,
-        tuple(tuple(block[i].t_us for i in mine) for mine in order),
+        tuple(tuple(block[i].t_us for i in indices) for indices in order),
         rgb.reshape(*lead, *shape),
         None if alpha is None else alpha.reshape(*lead, *shape[:2]),
         joined([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,

@@ -90,7 +90,8 @@ def _sample_directions() -> tuple[F64, tuple[F64, ...]]:
     directions = np.column_stack([r * np.cos(phi), r * np.sin(phi), z])
     basis = sh_basis(directions)
     return directions, tuple(
-        np.asarray(np.linalg.pinv(basis[:, d * d : (d + 1) ** 2])) for d in range(4)
+        np.asarray(np.linalg.pinv(basis[:, degree * degree : (degree + 1) ** 2]))
+        for degree in range(4)
     )
 
 

@@ -79,7 +79,7 @@ class Controls:
         states = [replace(planar(observation.ego), x_m=0.0, y_m=0.0, yaw_rad=0.0)]
         for _ in times[1:]:
             states.append(step(states[-1], command, step_s, self._vehicle, step_s))
-        rows = np.array([(one.x_m, one.y_m, one.yaw_rad) for one in states])
+        rows = np.array([(state.x_m, state.y_m, state.yaw_rad) for state in states])
         return Plan(observation.t_us, times, rows[:, :2], rows[:, 2])
 
 
@@ -190,7 +190,7 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
         self._renderer = renderer
         self.render_mode = render_mode
         self._scenario = self._scenarios[0]
-        names = [one.name for one in self._scenario.cameras]
+        names = [camera.name for camera in self._scenario.cameras]
         name = camera if camera is not None else names[0] if names else ""
         if name and name not in names:
             raise InputError(
@@ -205,7 +205,9 @@ class DriveEnv(gymnasium.Env[dict[str, Any], Any]):  # type: ignore[misc]  # gym
                 f"render_mode={render_mode!r}: it has {self.metadata['render_modes']}",
                 "rgb_array needs a camera",
             )
-        self._camera = next((one for one in self._scenario.cameras if one.name == name), None)
+        self._camera = next(
+            (camera for camera in self._scenario.cameras if camera.name == name), None
+        )
         vehicle = self._scenario.vehicle
         self._actions = (
             Controls(vehicle)
@@ -378,7 +380,7 @@ def _check(
 ) -> None:
     faults = {
         f"scene_seeds={()}": not scenarios,
-        "latency=measured": "measured" in {one.latency.kind for one in scenarios},
+        "latency=measured": "measured" in {scenario.latency.kind for scenario in scenarios},
         f"actions={actions!r}": actions not in ("controls", "trajectory"),
         f"preset={preset!r}": preset not in ("paper", "strict"),
         f"horizon_us={horizon_us}, step_us={step_us}": not 0 < step_us <= horizon_us

@@ -111,7 +111,7 @@ class Scorer:
         to_box = T_rig_box(scenario.vehicle)
         times = np.array([ego.t_us for ego, _ in window], dtype=np.int64)
         ego = trajectory_from_poses(
-            times, np.array([one.T_world_rig @ to_box for one, _ in window])
+            times, np.array([ego.T_world_rig @ to_box for ego, _ in window])
         )
         actors = {}
         for actor_id in dict.fromkeys(name for _, others in window for name in others):

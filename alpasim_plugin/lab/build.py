@@ -33,7 +33,7 @@ def stage(target: Path) -> None:
             path.is_file()
             and path.name != PROJECT
             and path.suffix != ".pyc"
-            and not any(one.endswith(".egg-info") for one in path.parts)
+            and not any(part.endswith(".egg-info") for part in path.parts)
         ):
             copy(path, target / "alpasim_plugin" / "lab" / path.relative_to(HERE))
     text = (HERE / PROJECT).read_text()

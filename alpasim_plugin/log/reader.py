@@ -115,7 +115,9 @@ def _collect(got: _Collected, kind: str, entry: logging_pb2.LogEntry) -> None:
         got.seed = entry.driver_session_request.random_seed
     elif kind == "traffic_session_request":
         objects = entry.traffic_session_request.logged_object_trajectories
-        got.static_ids.update(one.object_id for one in objects if one.is_static)
+        got.static_ids.update(
+            trajectory.object_id for trajectory in objects if trajectory.is_static
+        )
     elif kind == "available_cameras_return":
         cameras = entry.available_cameras_return.available_cameras
         specs = {camera.logical_id: read_camera(camera) for camera in cameras}
@@ -147,7 +149,7 @@ def _driver_return(got: _Collected, message: egodriver_pb2.DriveResponse) -> Non
             request.time_query_us,
             read_trajectory(message.trajectory, location),
             samples,
-            np.array([[p.x, p.y] for p in got.route.waypoints]).reshape(-1, 2),
+            np.array([[point.x, point.y] for point in got.route.waypoints]).reshape(-1, 2),
         )
     )
 
@@ -253,8 +255,8 @@ def _box(aabb: common_pb2.AABB, path: Path, actor: str) -> Box:
     """
     box = Box(
         *(
-            float(np.format_float_positional(np.float32(v)))
-            for v in (aabb.size_x, aabb.size_y, aabb.size_z)
+            float(np.format_float_positional(np.float32(size_m)))
+            for size_m in (aabb.size_x, aabb.size_y, aabb.size_z)
         )
     )
     for side in (box.length_m, box.width_m):

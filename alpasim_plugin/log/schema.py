@@ -278,12 +278,12 @@ def wire_render_request(
         first = request.actors if request.exposure is None else request.exposure.actors_start
         start_and_end = [
             wire_poses(stack[:, :3, 3], quat_from_matrix(stack[:, :3, :3]), f"actors {ids}")
-            for stack in (np.stack([at[i] for i in ids]) for at in (first, request.actors))
+            for stack in (np.stack([poses[i] for i in ids]) for poses in (first, request.actors))
         ]
         pair = sensorsim_pb2.PosePair
         objects = [
-            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=p, end_pose=q))
-            for i, p, q in zip(ids, *start_and_end, strict=True)
+            sensorsim_pb2.DynamicObject(track_id=i, pose_pair=pair(start_pose=start, end_pose=end))
+            for i, start, end in zip(ids, *start_and_end, strict=True)
         ]
     return sensorsim_pb2.RGBRenderRequest(
         scene_id=scene_id,
@@ -323,13 +323,13 @@ def wire_traffic_session(header: RolloutHeader) -> traffic_pb2.TrafficSessionReq
     ]
     objects += [
         traffic_pb2.ObjectTrajectory(
-            aabb=wire_box(a.box),
-            trajectory=wire_trajectory(a.track, f"track of actor {a.actor_id!r}"),
-            object_id=a.actor_id,
-            is_static=a.is_static,
-            label_class=a.label,
+            aabb=wire_box(actor.box),
+            trajectory=wire_trajectory(actor.track, f"track of actor {actor.actor_id!r}"),
+            object_id=actor.actor_id,
+            is_static=actor.is_static,
+            label_class=actor.label,
         )
-        for a in header.actors
+        for actor in header.actors
     ]
     return traffic_pb2.TrafficSessionRequest(
         session_uuid=header.session_uuid,
@@ -372,8 +372,8 @@ def read_trajectory(message: common_pb2.Trajectory, name: str) -> Trajectory:
     Raises:
         InputError: Times do not increase strictly, or a pose is bad (see `read_poses`).
     """
-    t_us = increasing_times([p.timestamp_us for p in message.poses], name)
-    xyz, quat = read_poses((p.pose for p in message.poses), name)
+    t_us = increasing_times([pose.timestamp_us for pose in message.poses], name)
+    xyz, quat = read_poses((pose.pose for pose in message.poses), name)
     return Trajectory(t_us, xyz, quat)
 
 

@@ -77,8 +77,10 @@ def trace_log(path: Path, facts: Iterable[Mapping[str, Fact]]) -> Trace:
         kind = entry.WhichOneof("log_entry")
         if kind == "actor_poses":
             poses = entry.actor_poses
-            ego = [p.SerializeToString() for p in poses.actor_poses if p.actor_id == EGO]
-            others = [p.SerializeToString() for p in poses.actor_poses if p.actor_id != EGO]
+            ego = [pose.SerializeToString() for pose in poses.actor_poses if pose.actor_id == EGO]
+            others = [
+                pose.SerializeToString() for pose in poses.actor_poses if pose.actor_id != EGO
+            ]
             trace[poses.timestamp_us, "ego", "pose"] = _joined(ego)
             trace[poses.timestamp_us, "actors", "poses"] = _joined(others)
         elif kind == "controller_return":

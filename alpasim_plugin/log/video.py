@@ -186,8 +186,12 @@ class VideoReader:
         height, width = self._upright(first).shape[:2]
         turned = (width, height) != (first.width, first.height)
         aspect = Fraction(self._stream.sample_aspect_ratio or 1)
-        others = [one for one in self._container.streams.video if one.index != self._stream.index]
-        tracks = [f"video track {one.index} ({one.width}x{one.height})" for one in others]
+        others = [
+            stream for stream in self._container.streams.video if stream.index != self._stream.index
+        ]
+        tracks = [
+            f"video track {stream.index} ({stream.width}x{stream.height})" for stream in others
+        ]
         self.format = VideoFormat(
             width=width,
             height=height,

@@ -143,7 +143,8 @@ class AslWriter:
         )
         pose = logging_pb2.ActorPoses.ActorPose
         entries = [
-            pose(actor_id=i, actor_pose=m) for i, m in zip([*ids, EGO], messages, strict=True)
+            pose(actor_id=i, actor_pose=message)
+            for i, message in zip([*ids, EGO], messages, strict=True)
         ]
         self._write(actor_poses=logging_pb2.ActorPoses(timestamp_us=t_us, actor_poses=entries))
 
@@ -289,8 +290,8 @@ class AslWriter:
         box = message.ActorDefinitions.ActorAABB
         actors = [box(actor_id=EGO, aabb=wire_box(header.vehicle.box))]
         actors += [
-            box(actor_id=a.actor_id, aabb=wire_box(a.box), actor_label=a.label)
-            for a in header.actors
+            box(actor_id=actor.actor_id, aabb=wire_box(actor.box), actor_label=actor.label)
+            for actor in header.actors
         ]
         return message(
             session_metadata=message.SessionMetadata(

@@ -101,7 +101,8 @@ def read_background(
         low = path.min(axis=0)
         high = path.max(axis=0)
         drive = ", ".join(
-            f"{axis} {a:.1f} to {b:.1f}" for axis, a, b in zip("xyz", low, high, strict=True)
+            f"{axis} {least:.1f} to {most:.1f}"
+            for axis, least, most in zip("xyz", low, high, strict=True)
         )
         raise InputError(
             f"{background.path}: {coverage}, which runs through {drive} m: nothing of it would be seen",

@@ -204,7 +204,9 @@ class ImportedRenderer(SplatRenderer):
             f"imported:{reconstruction_key(scenario, None)}",
             lambda: _graph(Reconstruction.load(folder), scenario),
         )
-        self.fitted = [one for one in scenario.recording if one.use == "fitted"]
+        self.fitted = [
+            photograph for photograph in scenario.recording if photograph.use == "fitted"
+        ]
 
     def developed(self, request: RenderRequest, out: RasterOutput) -> RasterOutput:
         """Return the image with the exposure that the recording's camera had near by."""
@@ -234,11 +236,11 @@ class ImportedRenderer(SplatRenderer):
 
 def exposure_near(fitted: Sequence[Photograph], camera: str, place: F64) -> F32:
     """Return the gain ``(3,)`` at a place: see `gain_near`; the pinholes of a lens have its own."""
-    cameras = [one.camera for one in fitted]
+    cameras = [photograph.camera for photograph in fitted]
     return gain_near(
         camera if camera in cameras else lens_camera(camera),
         place,
         cameras,
-        np.array([one.T_world_camera[:3, 3] for one in fitted]),
-        np.array([one.exposure for one in fitted]),
+        np.array([photograph.T_world_camera[:3, 3] for photograph in fitted]),
+        np.array([photograph.exposure for photograph in fitted]),
     )

@@ -62,7 +62,7 @@ def build(
     )
     scene_id = scenario.scene_id
     believed = misplaced(views, recipe.pose_error_m, scene_id, splat.seed)
-    boxes = {one.actor_id: one.box for one in scenario.actors}
+    boxes = {actor.actor_id: actor.box for actor in scenario.actors}
     start = rough_start(believed, boxes, recipe, scene_id)
     start = Start(start.background, start.actors if recipe.fit_actors else {})
     fitted = fit(

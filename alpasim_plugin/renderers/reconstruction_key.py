@@ -248,10 +248,12 @@ def write_model(
     np.savez_compressed(
         folder / SKY_VIEWS,
         size=np.array(
-            [[v.camera.width, v.camera.height] for v in sky_views], dtype=np.int64
+            [[view.camera.width, view.camera.height] for view in sky_views], dtype=np.int64
         ).reshape(-1, 2),
-        K=np.array([v.camera.K for v in sky_views]).reshape(-1, 3, 3),
-        T_camera_world=np.array([v.camera.T_camera_world for v in sky_views]).reshape(-1, 4, 4),
+        K=np.array([view.camera.K for view in sky_views]).reshape(-1, 3, 3),
+        T_camera_world=np.array([view.camera.T_camera_world for view in sky_views]).reshape(
+            -1, 4, 4
+        ),
         sky=np.concatenate(bits) if bits else np.zeros(0, dtype=np.uint8),
         name=np.array([view.name for view in sky_views], dtype=np.str_),
     )

@@ -26,8 +26,8 @@ class SnowCover:
 
     def __init__(self, scenario: Scenario) -> None:
         lanes = scenario.lane_map.lanes.values()
-        centres = [one.centre for one in lanes if one.kind == "vehicle"]
-        paths = [polyline_path(one) for one in centres if arc_lengths(one)[-1] > STEP_M]
+        centres = [lane.centre for lane in lanes if lane.kind == "vehicle"]
+        paths = [polyline_path(centre) for centre in centres if arc_lengths(centre)[-1] > STEP_M]
         quads = [np.zeros((0, 4, 3))]
         shares = []
         for share, right_m, left_m in STRIPS_M:

@@ -124,7 +124,9 @@ class WeatherRenderer(Renderer):
 
     def recorded(self) -> Sequence[RecordedFrame]:
         """Return the base renderer's recorded frames in the weather, with the ego where it was."""
-        return [replace(one, read=partial(self._recorded, one)) for one in self.base.recorded()]
+        return [
+            replace(frame, read=partial(self._recorded, frame)) for frame in self.base.recorded()
+        ]
 
     def facts(self) -> Mapping[str, Any]:
         """Return the base renderer's facts and the weather."""

@@ -138,7 +138,7 @@ def _is_part_of(part: str, kind: str, label: str, plan: RunPlan) -> bool:
         return part == f"{kind} {label}"
     spec = next(spec for spec in plan.renderers if spec.name == label)
     parts = [spec.base] if spec.fixer is None else [spec.base, spec.fixer]
-    return part in {f"{one.kind} {one.name}" for one in parts}
+    return part in {f"{part.kind} {part.name}" for part in parts}
 
 
 def _file_changes(

@@ -77,7 +77,7 @@ def plan_of_two(
     n_scenes = len(plan.scenarios)
     if least_scenes(question, n_scenes) is None:
         least = least_scenes(question) or f"more than {MOST_SCENES}"
-        margins = ", ".join(f"{one.metric}={one.margin:g}" for one in question.metrics)
+        margins = ", ".join(f"{metric.metric}={metric.margin:g}" for metric in question.metrics)
         raise InputError(
             f"--until-decided: {n_scenes} scenes, the margins {margins} take at least {least}",
             "Name more scenes or wider margins, or use simrun gate, which is about these scenes.",

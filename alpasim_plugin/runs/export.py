@@ -287,17 +287,19 @@ def _finish(
     ):
         write_text(folder / file, yaml.safe_dump(content, sort_keys=False))
     failed = [
-        m for m in manifests if not m.ok and (m.renderer, m.policy) == (run.renderer, run.policy)
+        manifest
+        for manifest in manifests
+        if not manifest.ok and (manifest.renderer, manifest.policy) == (run.renderer, run.policy)
     ]
     if failed:
         rows = [
             {
                 "run_name": name,
-                "clipgt_id": m.scene,
-                "rollout_id": f"seed-{m.seed}",
-                "error": "" if m.error is None else m.error.message,
+                "clipgt_id": manifest.scene,
+                "rollout_id": f"seed-{manifest.seed}",
+                "error": "" if manifest.error is None else manifest.error.message,
             }
-            for m in failed
+            for manifest in failed
         ]
         write_json(folder / FAILED, rows)
 

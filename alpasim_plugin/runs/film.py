@@ -55,7 +55,9 @@ class Film:
 def beside(images: Sequence[U8]) -> U8:
     """Return images ``(H, W, 3)`` beside one another, black below those that are lower."""
     height = max(len(image) for image in images)
-    return np.hstack([np.pad(one, ((0, height - len(one)), (0, 0), (0, 0))) for one in images])
+    return np.hstack(
+        [np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in images]
+    )
 
 
 def write_film(folder: Path, scenario: Scenario, renderer: Renderer) -> None:

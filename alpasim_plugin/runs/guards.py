@@ -58,7 +58,9 @@ def checked_frames(
     location = defined(renderer, "render")
     request_views = requests
     if not is_own(renderer):
-        request_views = [replace(read_only(one), camera=read_only(one.camera)) for one in requests]
+        request_views = [
+            replace(read_only(request), camera=read_only(request.camera)) for request in requests
+        ]
     with blaming(kind, name, location, not is_own(renderer)):
         frames = list(renderer.render_batch(request_views))
     problem = f"{len(frames)} frames for {len(requests)} requests"

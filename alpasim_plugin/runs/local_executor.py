@@ -345,7 +345,7 @@ class _Pool(Generic[J, R]):
             while len(self._busy) < self.workers and (startable := self._startable(waiting)):
                 self._begin(waiting, startable)
             wait([handle for worker in self._busy for handle in worker.handles], POLL_S)
-            for worker in [one for one in self._busy if one.is_done(self._limit_s)]:
+            for worker in [worker for worker in self._busy if worker.is_done(self._limit_s)]:
                 result = worker.take(self._limit_s)
                 self._busy.remove(worker)
                 if not isinstance(result, Lost):

@@ -152,7 +152,9 @@ class LoopState:
         """Return the policy's observation at the present instant. Its arrays cannot be written,
         since the world, the fixer's history and the log hold the same ones; its tensors are copies.
         """
-        tensors = [one.camera for one in sensors if one.device and one.camera in self.frames]
+        tensors = [
+            sensor.camera for sensor in sensors if sensor.device and sensor.camera in self.frames
+        ]
         return Observation(
             self.ego.t_us,
             {name: read_only(frame) for name, frame in self.frames.items()},

@@ -45,9 +45,11 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
     frames = 0
     for scenario in scenarios:
         cameras = scenario.cameras
-        key = tuple((one.name, one.lens is None, one.T_rig_camera.tobytes()) for one in cameras)
+        key = tuple(
+            (camera.name, camera.lens is None, camera.T_rig_camera.tobytes()) for camera in cameras
+        )
         if policy.address is not None:
-            built[key] = [SensorSpec(one.name) for one in cameras]
+            built[key] = [SensorSpec(camera.name) for camera in cameras]
         elif key not in built:
             made = complete(make_policy(policy.name, scenario), Policy)
             built[key] = checked_sensors(made)

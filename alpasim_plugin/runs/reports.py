@@ -47,7 +47,9 @@ def write_reports(root: Path, page: bool = True) -> Path | None:
     run = read_run(root)
     if page and not run.info.is_of_logs:
         write_flips(run)
-        failed = {one.cell[:3]: one for one in reversed(run.rollouts) if outcomes_of(one)}
+        failed = {
+            rollout.cell[:3]: rollout for rollout in reversed(run.rollouts) if outcomes_of(rollout)
+        }
         for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
             write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
     write_summary_md(run)
@@ -127,8 +129,8 @@ def _divergence(root: Path, flip: Flip, name: str) -> JsonObject:
         return {"t_us": None, "reason": "the policy broke off one of the drives"}
     try:
         logs = {
-            name: read_log(root / r.path / LOG_NAME)
-            for name, r in zip(flip.sides, (flip.base, flip.other), strict=True)
+            name: read_log(root / rollout.path / LOG_NAME)
+            for name, rollout in zip(flip.sides, (flip.base, flip.other), strict=True)
         }
     except SimrunError as error:
         return {"t_us": None, "reason": f"a log could not be read: {error.message}"}

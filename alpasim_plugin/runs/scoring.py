@@ -127,9 +127,9 @@ def _ego_rows(rollout: RolloutLog) -> list[JsonObject]:
         "ego_speed_mps": _speeds(rig.t_us, rig.xyz),
     }
     return [
-        _row(t, name, float(v))
+        _row(t, name, float(value))
         for name, values in state.items()
-        for t, v in zip(rig.t_us.tolist(), values, strict=True)
+        for t, value in zip(rig.t_us.tolist(), values, strict=True)
     ]
 
 

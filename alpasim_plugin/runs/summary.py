@@ -141,7 +141,10 @@ def _of_policies(manifests: Sequence[Manifest]) -> dict[str, list[Manifest]]:
 def _speeds(manifests: Sequence[Manifest]) -> dict[str, Speed]:
     timed = [manifest for manifest in manifests if manifest.stage_ms]
     renderers = dict.fromkeys(manifest.renderer for manifest in timed)
-    return {name: speed([m for m in timed if m.renderer == name]) for name in renderers}
+    return {
+        name: speed([manifest for manifest in timed if manifest.renderer == name])
+        for name in renderers
+    }
 
 
 def speed(manifests: Sequence[Manifest]) -> Speed:
@@ -170,14 +173,18 @@ def speed(manifests: Sequence[Manifest]) -> Speed:
         per_frame.extend(total[opening:].tolist())
     if not per_frame:
         return Speed(None, None, None, None, None, {})
-    all_ms = sum(sum(d) for d in stages.values())
+    all_ms = sum(sum(times_ms) for times_ms in stages.values())
     return Speed(
         ms_per_frame_p50=round(float(np.percentile(per_frame, 50)), 3),
         ms_per_frame_p95=round(float(np.percentile(per_frame, 95)), 3),
         ms_per_frame_mean=round(float(np.mean(per_frame)), 3),
         frames_per_s=round(1e3 / float(np.mean(per_frame)), 2),
         first_frame_ms=round(float(np.median(first)), 3),
-        stages={name: _stage(d, all_ms, len(per_frame)) for name, d in stages.items() if any(d)},
+        stages={
+            name: _stage(times_ms, all_ms, len(per_frame))
+            for name, times_ms in stages.items()
+            if any(times_ms)
+        },
     )
 
 
@@ -216,7 +223,7 @@ def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed
     """Return percentiles of the passes that took place (a frame from a draft has none through the
     fixer), share and mean per frame.
     """
-    passes = [d for d in durations if d > 0.0]
+    passes = [seconds for seconds in durations if seconds > 0.0]
     total = sum(durations)
     return StageSpeed(
         p50_ms=round(float(np.percentile(passes, 50)), 3),
@@ -243,10 +250,10 @@ def pool_of(
         before: What the folder says so far.
         executor: Where rollouts ran; None: on this machine.
     """
-    fresh = [m for m in manifests if not m.reused]
+    fresh = [manifest for manifest in manifests if not manifest.reused]
     if not fresh and before is not None:
         return replace(before, executor=before.executor or executor)
-    frames = sum((m.frames or 0) for m in fresh)
+    frames = sum((manifest.frames or 0) for manifest in fresh)
     has_speed = frames > 0 and wall_s > 0
     return Pool(
         workers=threads.workers,

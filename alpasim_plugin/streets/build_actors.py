@@ -92,7 +92,9 @@ def build_actor(actor: Actor, scenario: Scenario) -> SceneNode:
         box = actor.box
         half = np.array(box.size_m) / 2 + OUTSIDE_M
         if (reach > half).any(axis=1).mean() > SPILL:
-            extent = " x ".join(f"{2 * one:.2f}" for one in np.quantile(reach, 1 - SPILL, axis=0))
+            extent = " x ".join(
+                f"{2 * reach_m:.2f}" for reach_m in np.quantile(reach, 1 - SPILL, axis=0)
+            )
             raise InputError(
                 f"{actor.appearance}: Gaussians of {extent} m outside of the box of {actor.actor_id}, {box.length_m:g} x {box.width_m:g} x {box.height_m:g} m",
                 "give the actor this size_m, in a file whose origin is the middle of the box",

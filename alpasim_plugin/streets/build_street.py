@@ -109,8 +109,8 @@ def _kerb_rows(count: int) -> list[tuple[float, float, tuple[float, float], floa
     face = SPREAD * KERB_M / count
     top = SPREAD * KERB_WIDTH_M / count
     return [
-        *((0.0, m * KERB_M, (0.01, face), 0.80) for m in middles),
-        *((m * KERB_WIDTH_M, KERB_M, (top, 0.01), 1.05) for m in middles),
+        *((0.0, middle_m * KERB_M, (0.01, face), 0.80) for middle_m in middles),
+        *((middle_m * KERB_WIDTH_M, KERB_M, (top, 0.01), 1.05) for middle_m in middles),
     ]
 
 
@@ -252,14 +252,14 @@ def lamp_posts(site: Site, houses: Houses) -> LampPosts:
 def _poles(site: Site, houses: Houses) -> list[Item]:
     """Set lamp posts along the road and the poles that the map names."""
     places, foot, top, tip = lamp_posts(site, houses)
-    mapped = [p for p in site.scenario.lane_map.poles if len(p) > 1]
+    mapped = [line for line in site.scenario.lane_map.poles if len(line) > 1]
     if len(places) == 0 and not mapped:
         return []
-    starts = [foot, top, *[p[:-1] for p in mapped]]
-    ends = [top, tip, *[p[1:] for p in mapped]]
+    starts = [foot, top, *[line[:-1] for line in mapped]]
+    ends = [top, tip, *[line[1:] for line in mapped]]
     start = np.concatenate(starts)
     end = np.concatenate(ends)
-    owner = np.concatenate([places, places, *[site.frame.to_ground(p[:-1]) for p in mapped]])
+    owner = np.concatenate([places, places, *[site.frame.to_ground(line[:-1]) for line in mapped]])
     items = []
     for cell_m, step in ((0.3, 0.45), (1.2, 1.6)):
         poles = rods(start, end, 0.085, POLE_RGB, step)

@@ -54,7 +54,7 @@ def marking_strokes(site: Site) -> Strokes:
         line = site.frame.to_ground(stop)
         if len(line) > 1:
             pieces.append(_strokes(line[:-1], line[1:], STOP_LINE_M, WHITE))
-    pieces = [p for p in pieces if len(p.start)]
+    pieces = [piece for piece in pieces if len(piece.start)]
     if not pieces:
         return Strokes(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.int64))
     joined = Strokes(*(np.concatenate(column) for column in zip(*pieces, strict=True)))

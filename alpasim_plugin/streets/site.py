@@ -281,9 +281,9 @@ def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
     rings = []
     for lane in lanes:
         areas = [
-            p
-            for p in shapely.get_parts(lane_polygon(lane))
-            if shapely.get_dimensions(p) == 2 and not shapely.is_empty(p)
+            part
+            for part in shapely.get_parts(lane_polygon(lane))
+            if shapely.get_dimensions(part) == 2 and not shapely.is_empty(part)
         ]
         rings += [shapely.get_coordinates(shapely.get_exterior_ring(area)) for area in areas]
     return rings
@@ -355,7 +355,7 @@ def contours(site: Site, beyond_m: float, within_path_m: float) -> list[F64]:
         wrapped = np.concatenate([plan[-SMOOTH:], plan, plan[:SMOOTH]])
         kernel = np.ones(SMOOTH) / SMOOTH
         smooth = np.column_stack(
-            [np.convolve(wrapped[:, d], kernel, mode="same") for d in range(2)]
+            [np.convolve(wrapped[:, axis], kernel, mode="same") for axis in range(2)]
         )[SMOOTH:-SMOOTH]
         h, w = mask.shape
         inner = (
@@ -377,7 +377,7 @@ def _runs(points: F64, keep: Bool) -> list[F64]:
     points = np.roll(points, -start, axis=0)
     keep = np.roll(keep, -start)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
-    return [points[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [points[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _road_on_left(site: Site, line: F64) -> F64:

@@ -63,11 +63,11 @@ class Footprints:
         """Return the corners ``(N, 4, 2)``."""
         if self.float32:
             # Rounded after each step, the centre first, as AlpaSim does.
-            x, y = (self.xy.astype(np.float32)[:, [d]] for d in (0, 1))  # (N, 1)
+            x, y = (self.xy.astype(np.float32)[:, [axis]] for axis in (0, 1))  # (N, 1)
             c = np.cos(self.yaw.astype(np.float32))[:, None]
             s = np.sin(self.yaw.astype(np.float32))[:, None]
             along, across = (
-                (UNIT_CORNERS[:, d] * self.size[:, [d]]).astype(np.float32) for d in (0, 1)
+                (UNIT_CORNERS[:, axis] * self.size[:, [axis]]).astype(np.float32) for axis in (0, 1)
             )  # (N, 4)
             return np.stack(
                 [(x + along * c) - across * s, (y + along * s) + across * c], axis=-1

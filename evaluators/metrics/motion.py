@@ -68,7 +68,7 @@ def rss_margin_m(ego: EgoStates, tracks: Tracks) -> F64:
     lateral = np.abs(to[..., 1] * ego.heading[:, 0] - to[..., 0] * ego.heading[:, 1])
     c = np.abs(np.cos(tracks.yaw - ego.yaw))
     s = np.abs(np.sin(tracks.yaw - ego.yaw))
-    length, width = (tracks.size[:, [d]] / 2 for d in (0, 1))
+    length, width = (tracks.size[:, [axis]] / 2 for axis in (0, 1))
     gap_m = along - ego.size[0] / 2 - (length * c + width * s)
     ahead_mps = (
         tracks.velocity[..., 0] * ego.heading[:, 0] + tracks.velocity[..., 1] * ego.heading[:, 1]

@@ -226,8 +226,12 @@ def motion(ego: EgoStates, place: Place = "centre") -> dict[str, F64]:
     }
     out = {name: smooth(values) for name, values in accel.items()}
     out |= {
-        to: derivative(out[source], ego.t_us, window=15)
-        for to, source in (("lon_jerk", "lon_accel"), ("lat_jerk", "lat_accel"), ("jerk", "accel"))
+        derived: derivative(out[source], ego.t_us, window=15)
+        for derived, source in (
+            ("lon_jerk", "lon_accel"),
+            ("lat_jerk", "lat_accel"),
+            ("jerk", "accel"),
+        )
     }
     yaw = np.unwrap(ego.yaw)
     return out | {

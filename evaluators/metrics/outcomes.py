@@ -324,9 +324,9 @@ def recorded_speed(along: F64, seconds: F64, v: F64, s: F64) -> tuple[F64, F64]:
     dwell = np.append(np.diff(seconds), 0.0)
     first = np.clip(np.searchsorted(along, s - BEHIND_M, "right") - 1, 0, None)
     last = np.maximum(np.searchsorted(along, s + AHEAD_M, "right"), first + 1)
-    windows = [slice(a, b) for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    return np.array([v[w].min() for w in windows]), np.array(
-        [dwell[w][v[w] < LEAST_MPS].sum() for w in windows]
+    windows = [slice(begin, end) for begin, end in zip(first.tolist(), last.tolist(), strict=True)]
+    return np.array([v[window].min() for window in windows]), np.array(
+        [dwell[window][v[window] < LEAST_MPS].sum() for window in windows]
     )
 
 

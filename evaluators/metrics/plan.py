@@ -51,7 +51,7 @@ class TrajectoryTable:
         xyz = self.xyz[self.rows(i)]
         grid = (t - t[0]).astype(np.float64)
         query = (t_us - t[0]).astype(np.float64)
-        return np.stack([np.interp(query, grid, xyz[:, d]) for d in range(3)], axis=1)
+        return np.stack([np.interp(query, grid, xyz[:, axis]) for axis in range(3)], axis=1)
 
     @property
     def owner(self) -> I64:

@@ -203,10 +203,13 @@ class Region:
         spread = [begin + (k * n) // 4 for k in range(4)]
         middle, _ = self._nearest(shapely.centroid(pieces))
         features = np.stack(
-            [middle, *(nearest[v] for v in (deepest, *spread))], axis=1
+            [middle, *(nearest[feature] for feature in (deepest, *spread))], axis=1
         )  # (M, _N_FEATURES)
         away = np.stack(
-            [segment_distance(self._start[f], self._end[f], corner) for f in features[piece].T],
+            [
+                segment_distance(self._start[numbers], self._end[numbers], corner)
+                for numbers in features[piece].T
+            ],
             axis=1,
         )
         bound = np.full(len(pieces), np.inf)
@@ -271,8 +274,8 @@ def _quartered(owner: I64, pieces: Geometries) -> tuple[I64, Geometries]:
 def segment_distance(start: F64, end: F64, points: F64) -> F64:
     """Return distances ``(M,)`` between points ``(M, D)`` and segments ``(M, D)``, ``(M, D)``."""
     # One coordinate after the other: numpy is slow at rows of two or three numbers.
-    along = [end[:, d] - start[:, d] for d in range(start.shape[1])]
-    offset = [points[:, d] - start[:, d] for d in range(start.shape[1])]
+    along = [end[:, axis] - start[:, axis] for axis in range(start.shape[1])]
+    offset = [points[:, axis] - start[:, axis] for axis in range(start.shape[1])]
     length2 = sum(a * a for a in along)
     f = sum(a * o for a, o in zip(along, offset, strict=True))
     f = np.clip(np.divide(f, length2, out=np.zeros(len(start)), where=length2 > 0), 0.0, 1.0)

@@ -151,7 +151,7 @@ def chart(record: JsonView) -> Chart:
 def area_charts(record: JsonView) -> list[Chart]:
     """Draw every driven point of each variant."""
     charts = []
-    labels = [_label(*one) for one in zip(record["parameter"], record["unit"], strict=True)]
+    labels = [_label(*axis) for axis in zip(record["parameter"], record["unit"], strict=True)]
     for row, (name, facts) in enumerate(record["variants"].items()):
         colour = VARIANT[row % len(VARIANT)]
         axes = new_axes(*labels)

@@ -66,8 +66,8 @@ def write_summary_md(run: Run) -> Path:
     """
     path = run.folder / "summary.md"
     heads = [
-        f"{c.variant} ({plural(c.n_rollouts, 'rollout')}, {plural(c.n_scenes, 'scene')})"
-        for c in tables.columns(run)
+        f"{column.variant} ({plural(column.n_rollouts, 'rollout')}, {plural(column.n_scenes, 'scene')})"
+        for column in tables.columns(run)
     ]
     with reporting(run):
         metrics = [
@@ -79,15 +79,15 @@ def write_summary_md(run: Run) -> Path:
         ]
         pairs = [
             [
-                p.variant,
-                p.baseline,
-                p.metric,
-                p.diff.text,
-                p.interval.text,
-                p.p_value.text,
-                p.verdict,
+                pair.variant,
+                pair.baseline,
+                pair.metric,
+                pair.diff.text,
+                pair.interval.text,
+                pair.p_value.text,
+                pair.verdict,
             ]
-            for p in tables.pair_rows(run.summary.differences, run.table)
+            for pair in tables.pair_rows(run.summary.differences, run.table)
         ]
         note = contact_note(run.summary.preset)
         text = MARKDOWN.get_template("summary.md.j2").render(

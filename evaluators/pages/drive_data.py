@@ -83,7 +83,10 @@ def rounded(values: F64) -> list[float | None]:
         >>> rounded(np.array([0.123456789, np.nan, 3.0]))
         [0.12346, None, 3.0]
     """
-    return [float(f"{v:.{METRIC_DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
+    return [
+        float(f"{value:.{METRIC_DIGITS}g}") if np.isfinite(value) else None
+        for value in values.tolist()
+    ]
 
 
 def scene_of(run: Run, scene: str) -> tuple[JsonView, F64]:

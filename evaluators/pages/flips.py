@@ -124,7 +124,7 @@ def flip_bases(run: Run) -> list[Base]:
     """
     named = run.info.baseline
     _, by_policy = axis_bases(
-        [Variant(r, policy) for r in run.renderers for policy in run.policies], named
+        [Variant(renderer, policy) for renderer in run.renderers for policy in run.policies], named
     )
     bases = [Base(renderer=baseline_of(run))] if len(run.renderers) > 1 else []
     return [*bases, *([by_policy] if by_policy else [])]

@@ -222,9 +222,9 @@ def by_interest(run: Run) -> list[str]:
 
     def interest(scene: str) -> tuple[int, float]:
         rollouts = run.by_scene[scene]
-        events = sum(len(outcomes_of(r)) if has_ended(r) else 1 for r in rollouts)
-        far = [v for r in rollouts if (v := r.metrics.get("lateral_distance_m")) is not None]
-        return events, max(far, default=0.0)
+        events = sum(len(outcomes_of(rollout)) if has_ended(rollout) else 1 for rollout in rollouts)
+        distances_m = [rollout.metrics.get("lateral_distance_m") for rollout in rollouts]
+        return events, max((d_m for d_m in distances_m if d_m is not None), default=0.0)
 
     return sorted(run.by_scene, key=interest, reverse=True)
 

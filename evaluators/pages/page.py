@@ -115,7 +115,7 @@ def write_page(run: Run, path: Path, wanted: Wanted, max_bytes: int = MAX_BYTES)
         )
         page_cells = default_cells[: len(documents)]
         notes = _notes(cells, default_cells, default_cells[len(page_cells) :], stride)
-        texts = {name: as_json(thinned(one, stride)) for name, one in documents.items()}
+        texts = {name: as_json(thinned(document, stride)) for name, document in documents.items()}
         html = _render(index_data(run, cells, page_cells, notes, report), texts)
     write_text(path, html)
     return Page(path, path.stat().st_size, page_cells, cells, notes)

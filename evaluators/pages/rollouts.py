@@ -201,18 +201,21 @@ def rollout_block(run: Run) -> RolloutBlock:
     had = [outcomes_of(rollout) for rollout in rollouts]
     kinds = [name for name in OUTCOMES if any(name in names for names in had)]
     texts = {
-        "scene": [r.scene for r in rollouts],
-        "renderer": [r.renderer for r in rollouts],
-        "policy": [r.policy for r in rollouts],
-        "seed": [str(r.seed) for r in rollouts],
-        "folder": [quote(r.path) for r in rollouts],
-        "outcome": [in_words(outcomes_of(r)) if has_ended(r) else NOT_RUN for r in rollouts],
-        "ending": [ending_of(r) for r in rollouts],
-        "tone": [_tone(r) for r in rollouts],
-        "note": [_note(r)[:MAX_TEXT] for r in rollouts],
+        "scene": [rollout.scene for rollout in rollouts],
+        "renderer": [rollout.renderer for rollout in rollouts],
+        "policy": [rollout.policy for rollout in rollouts],
+        "seed": [str(rollout.seed) for rollout in rollouts],
+        "folder": [quote(rollout.path) for rollout in rollouts],
+        "outcome": [
+            in_words(outcomes_of(rollout)) if has_ended(rollout) else NOT_RUN
+            for rollout in rollouts
+        ],
+        "ending": [ending_of(rollout) for rollout in rollouts],
+        "tone": [_tone(rollout) for rollout in rollouts],
+        "note": [_note(rollout)[:MAX_TEXT] for rollout in rollouts],
     }
     walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
-    numbers = [walls | {"data": [_short(r.wall_s) for r in rollouts]}]
+    numbers = [walls | {"data": [_short(rollout.wall_s) for rollout in rollouts]}]
     for metric in run.table.ordered(run.metric_names):
         facts = run.table.shown(metric)
         numbers.append(
@@ -222,7 +225,7 @@ def rollout_block(run: Run) -> RolloutBlock:
                 "percent": facts.in_percent,
                 "headline": facts.is_headline,
                 "flag": facts.is_flag,
-                "data": [_short(r.metrics.get(metric)) for r in rollouts],
+                "data": [_short(rollout.metrics.get(metric)) for rollout in rollouts],
             }
         )
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1

@@ -196,7 +196,7 @@ def runs_table(entries: Sequence[RunEntry], root: Path, metrics: Sequence[str]) 
         if metrics:
             texts = ["\n".join(column) for column in parts]
             for metric in metrics:
-                texts.append("\n".join(value_text(entry, metric, *one) for one in variants))
+                texts.append("\n".join(value_text(entry, metric, *variant) for variant in variants))
         info = NO_INFO if entry.info is None else entry.info
         began = (info.started_at or DASH)[:16].replace("T", " ")
         table.add_row(

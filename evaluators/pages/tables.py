@@ -228,8 +228,13 @@ def columns(run: Run) -> list[Column]:
     heads = []
     for variant in run.variants:
         rollouts = run.rollouts_of(variant)
-        done = [r for r in rollouts if r.ok]
+        done = [rollout for rollout in rollouts if rollout.ok]
         heads.append(
-            Column(variant, len(done), len(rollouts) - len(done), len({r.scene for r in done}))
+            Column(
+                variant,
+                len(done),
+                len(rollouts) - len(done),
+                len({rollout.scene for rollout in done}),
+            )
         )
     return heads

@@ -112,7 +112,9 @@ def _log_of(run: Run, rollout: Rollout) -> RolloutLog | None:
 def _shot(run: Run, rollout: Rollout, t_us: int) -> Shot | None:
     log = _log_of(run, rollout)
     cameras = [] if log is None else sources(run, rollout, log)
-    images = [image for image in (_frame_at(one, t_us) for one in cameras) if image is not None]
+    images = [
+        image for image in (_frame_at(camera, t_us) for camera in cameras) if image is not None
+    ]
     if log is None or not images:
         return None
     outcomes = outcomes_of(rollout)

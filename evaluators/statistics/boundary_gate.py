@@ -42,7 +42,7 @@ def boundary_verdict(
     earlier = record if stored is None else stored
     record, earlier = _comparable(record, earlier, stored_name)
     variants = variants_in(table)
-    pairs = [(one, one) for one in variants if one.name in earlier["variants"]]
+    pairs = [(variant, variant) for variant in variants if variant.name in earlier["variants"]]
     if stored is None:
         named = spec.baseline and base_named(spec.baseline, variants, "the run")
         pairs = (named or usual_base(variants)).pairs(variants)

@@ -68,7 +68,7 @@ def decimals(*values: float | None, digits: int = 3) -> int:
     """Choose how many decimals show ``digits`` significant digits of the largest of the values, at
     most four.
     """
-    largest = max((abs(v) for v in values if v is not None), default=0.0)
+    largest = max((abs(value) for value in values if value is not None), default=0.0)
     if largest == 0.0:
         return 1
     return min(4, max(0, digits - 1 - math.floor(math.log10(largest))))
@@ -77,7 +77,7 @@ def decimals(*values: float | None, digits: int = 3) -> int:
 def fixed(value: float, places: int, sign: bool = False) -> str:
     """Print with a fixed number of decimals, U+2212 as minus, and no negative zero."""
     text = f"{abs(value):,.{places}f}".replace(",", "\u202f")
-    is_zero = not any(c in "123456789" for c in text)
+    is_zero = not any(character in "123456789" for character in text)
     if value < 0 and not is_zero:
         return "\u2212" + text
     return ("+" if sign and not is_zero else "") + text

@@ -47,12 +47,14 @@ def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> di
     variants: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         variants.setdefault(rollout.variant, []).append(rollout)
-    return {name: _of_variant(own, times or {}) for name, own in variants.items()}
+    return {name: _of_variant(rollouts, times or {}) for name, rollouts in variants.items()}
 
 
 def _of_variant(rollouts: Sequence[Rollout], times: Times) -> Endings:
-    ended = [r for r in rollouts if has_ended(r)]
-    distances = [v for r in rollouts if r.ok and (v := r.metrics.get(DISTANCE)) is not None]
+    ended = [rollout for rollout in rollouts if has_ended(rollout)]
+    distances = [
+        v for rollout in rollouts if rollout.ok and (v := rollout.metrics.get(DISTANCE)) is not None
+    ]
     counts = Counter(map(ending_of, rollouts))
     places: dict[str, list[EventPlace]] = {}
     for rollout in ended:
@@ -63,8 +65,8 @@ def _of_variant(rollouts: Sequence[Rollout], times: Times) -> Endings:
     return Endings(
         n_rollouts=len(rollouts),
         n_ended=len(ended),
-        n_failed=sum(bool(outcomes_of(r)) for r in ended),
-        n_reached_end=sum(reached_end(r) for r in ended),
+        n_failed=sum(bool(outcomes_of(rollout)) for rollout in ended),
+        n_reached_end=sum(reached_end(rollout) for rollout in ended),
         endings={name: counts[name] for name in ENDINGS if name in counts},
         outcomes={
             name: EventCount(len(places[name]), tuple(places[name][:LISTED]))

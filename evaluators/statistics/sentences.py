@@ -5,6 +5,7 @@ report and the terminal.
 import shlex
 from collections.abc import Sequence
 
+from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.core.types import MetricInfo
 from evaluators.results import Difference, to_json
@@ -190,13 +191,13 @@ def change_text(entry: JsonView, metric: MetricInfo) -> str:
         margin = entry["margin"] * scale
         parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":
-        parts.append(f"worst in {_some([_place(pair) for pair in entry['worst']])}")
+        parts.append(f"worst in {some_of([_place(pair) for pair in entry['worst']], NAMED)}")
     if entry["cut_mean"] is not None:
         parts.extend(_cut_texts(entry, scale, unit))
     if entry["n_far"]:
         parts.append(f"{plural(entry['n_far'], 'scene')} beyond three margins")
     if entry["cut"]:
-        parts.append(f"not compared, as an event ended one side: {_some(entry['cut'])}")
+        parts.append(f"not compared, as an event ended one side: {some_of(entry['cut'], NAMED)}")
     if entry["n_short"]:
         parts.append(f"an event cut both sides short in {plural(entry['n_short'], 'pair')}")
     if entry["n_neither"]:
@@ -232,8 +233,3 @@ def _seeds_text(seeds: int | None) -> str:
 
 def _place(pair: JsonView) -> str:
     return f"{pair['scene']} seed {pair['seed']}"
-
-
-def _some(names: list[str]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

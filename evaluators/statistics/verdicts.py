@@ -204,7 +204,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
         >>> holm([0.01, None, 0.04, 0.03])
         [0.03, None, 0.06, 0.06]
     """
-    tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    tested = sorted((p_value, i) for i, p_value in enumerate(p_values) if p_value is not None)
     out: list[float | None] = [None] * len(p_values)
     largest = 0.0
     for rank, (p, i) in enumerate(tested):

@@ -117,5 +117,5 @@ def exit_reason(code: int) -> str:
         >>> exit_reason(3), exit_reason(137)
         ('exit code 3', 'exit code 137 (SIGKILL)')
     """
-    names = {128 + int(one): one.name for one in signal.Signals}
+    names = {128 + int(number): number.name for number in signal.Signals}
     return f"exit code {code}" + (f" ({names[code]})" if code in names else "")

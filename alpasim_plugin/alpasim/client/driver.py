@@ -318,7 +318,7 @@ def cameras_of(
         if text is None
         else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
     )
-    missing = [b for _, b in pairs if b not in cameras_by_name]
+    missing = [camera for _, camera in pairs if camera not in cameras_by_name]
     if missing or not pairs:
         problem = (
             f"no camera {missing[0]!r} among {sorted(cameras_by_name)}" if missing else "no camera"
@@ -327,7 +327,7 @@ def cameras_of(
             f"scene {scenario.scene_id!r}: {problem}",
             "write ?cameras=THEIRS:OURS,...",
         )
-    return {a: cameras_by_name[b] for a, b in pairs}
+    return {name: cameras_by_name[camera] for name, camera in pairs}
 
 
 def require_room(cameras: Iterable[CameraSpec], encoding: ImageEncoding) -> None:

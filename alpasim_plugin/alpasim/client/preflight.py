@@ -81,7 +81,7 @@ class DriveTimes:
             self.problems.setdefault(
                 "the first pose is not at time_now", f"{t_us[0] - now:+d} us at {now}"
             )
-        if any(b <= a for a, b in pairwise(t_us)):
+        if any(later <= earlier for earlier, later in pairwise(t_us)):
             self.problems.setdefault("times do not increase strictly", f"at {now}")
         squares = [sum(getattr(pose.pose.quat, axis) ** 2 for axis in "wxyz") for pose in poses]
         if any(abs(square - 1) > 1e-4 for square in squares):

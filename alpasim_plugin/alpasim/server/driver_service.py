@@ -270,7 +270,8 @@ class Driving:
     def take_route(self, route: egodriver_pb2.Route) -> None:
         """Keep the newest route; a row of NaN ends it."""
         rows = np.array(
-            [(p.x, p.y, p.z) for p in route.waypoints[:ROUTE_POINTS]], dtype=np.float64
+            [(point.x, point.y, point.z) for point in route.waypoints[:ROUTE_POINTS]],
+            dtype=np.float64,
         ).reshape(-1, 3)
         with self._lock:
             self._route_rig = np.full((ROUTE_POINTS, 3), np.nan)

@@ -166,7 +166,7 @@ class Sessions(Generic[S]):
     @property
     def held(self) -> int:
         """Give the bytes that all sessions keep and work on."""
-        return self._working + sum(one.held for one in self._open.values())
+        return self._working + sum(session.held for session in self._open.values())
 
     def open(self, name: str, session: S) -> None:
         """Enter a session.
@@ -264,7 +264,11 @@ class Sessions(Generic[S]):
         """Close the sessions that nobody used for long."""
         with self._lock:
             now_s = self._clock()
-            old = [name for name, one in self._open.items() if now_s - one.used_s > self._expiry_s]
+            old = [
+                name
+                for name, session in self._open.items()
+                if now_s - session.used_s > self._expiry_s
+            ]
         for name in old:
             self.close(name)
 

@@ -158,7 +158,7 @@ def line_pixels(image: U8) -> Bool:
     """Return the pixels ``(H, W)`` of a drawn map that are lane markings: white or yellow, however
     faded.
     """
-    red, green, blue = (image[..., c].astype(np.int16) for c in range(3))
+    red, green, blue = (image[..., channel].astype(np.int16) for channel in range(3))
     top = np.maximum(np.maximum(red, green), blue)
     is_bright = (top >= 60) & (red * 10 >= top * 9) & (green * 10 >= top * 9)
     return is_bright & ((blue * 10 >= top * 9) | (blue * 10 <= top * 2))

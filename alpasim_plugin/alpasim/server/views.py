@@ -235,9 +235,9 @@ def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Camera
 
 def _opencv(p: Any, title: str) -> LensModel | None:
     lengths = (p.radial_coeffs, 6), (p.tangential_coeffs, 2), (p.thin_prism_coeffs, 4)
-    if any(len(given) > n for given, n in lengths):
+    if any(len(coefficients) > n for coefficients, n in lengths):
         raise InputError(f"{title}: more coefficients than k1..k6, p1, p2, s1..s4", DO_THIS)
-    k, t, s = ((*given, *[0.0] * (n - len(given))) for given, n in lengths)
+    k, t, s = ((*coefficients, *[0.0] * (n - len(coefficients))) for coefficients, n in lengths)
     if not any((*k, *t, *s)):
         return None
     return LensModel("opencv", (*k[:2], *t, *k[2:], *s))

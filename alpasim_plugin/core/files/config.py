@@ -386,7 +386,7 @@ def validate(model: type[M], document: Document) -> M:
     except ValidationError as error:
         problems = error.errors(include_url=False)
     # Wrong items make a list too short, and a misspelt key leaves the right one missing.
-    problems = [p for p in problems if p["type"] != "too_short"] or problems
+    problems = [problem for problem in problems if problem["type"] != "too_short"] or problems
     placed: list[tuple[bool, Mark, int, Key, Any]] = []
     for problem in problems[:MOST_PROBLEMS]:
         # The tag of a union of forms is in brackets and leads to no model.
@@ -502,7 +502,9 @@ def _forms_at(model: type[BaseModel], loc: Key) -> list[JsonObject]:
                 below.append(form)
             else:
                 below.append(fields.get(part, form.get("additionalProperties")))
-        forms = [form for one in below if isinstance(one, dict) for form in _plain(one, whole)]
+        forms = [
+            form for schema in below if isinstance(schema, dict) for form in _plain(schema, whole)
+        ]
     return forms
 
 
@@ -513,7 +515,7 @@ def _plain(form: JsonObject, whole: JsonObject) -> list[JsonObject]:
     options = form.get("anyOf") or form.get("oneOf")
     if options is None:
         return [form]
-    return [one for option in options for one in _plain(option, whole)]
+    return [form for option in options for form in _plain(option, whole)]
 
 
 def _tags(form: JsonObject) -> list[str]:

@@ -106,7 +106,7 @@ def contents(path: Path) -> str:
     """Say what a path is, for messages: a file, or a folder with its first names."""
     if not os.path.isdir(path):
         return "a file"
-    names = sorted((one.name for one in path.iterdir()), key=natural_order)
+    names = sorted((member.name for member in path.iterdir()), key=natural_order)
     return f"a folder with {some_of(names) or 'nothing'}"
 
 

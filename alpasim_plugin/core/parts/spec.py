@@ -236,11 +236,21 @@ def _arguments(
         parameters = inspect.signature(factory).parameters.values()
     except ValueError:  # some built-in callables have no signature
         return {}
-    named_parameters = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    named_parameters = [
+        parameter
+        for parameter in parameters
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    ]
     by_name = {
-        p.name: p for p in named_parameters if p.kind is not p.POSITIONAL_ONLY and p.name in values
+        parameter.name: parameter
+        for parameter in named_parameters
+        if parameter.kind is not parameter.POSITIONAL_ONLY and parameter.name in values
     }
-    unknown = [p.name for p in named_parameters if p.default is p.empty and p.name not in by_name]
+    unknown = [
+        parameter.name
+        for parameter in named_parameters
+        if parameter.default is parameter.empty and parameter.name not in by_name
+    ]
     if unknown:
         raise contract_error(spec.kind)(
             f"{spec.kind} {spec.name!r}: its factory asks for {', '.join(unknown)}",

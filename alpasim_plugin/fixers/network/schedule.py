@@ -80,7 +80,7 @@ def from_names(names: Sequence[float]) -> tuple[NoiseLevel, ...]:
     Raises:
         InputError: An empty or not strictly falling list, or a step out of range.
     """
-    if not names or any(b >= a for a, b in pairwise(names)):
+    if not names or any(later >= earlier for earlier, later in pairwise(names)):
         raise InputError(
             f"named steps: {list(names)}",
             "give at least one step, strictly falling from 1000",

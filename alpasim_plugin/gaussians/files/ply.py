@@ -224,18 +224,20 @@ def ply_rows(cloud: GaussianCloud) -> NDArray[np.void]:
 def _only_gaussian_element(header: PlyHeader) -> PlyElement:
     """Return the only element that may hold Gaussians, or say which there are."""
     candidates = [
-        e for e in header.elements if "opacity" in e.properties or e.name.startswith("vertex")
+        element
+        for element in header.elements
+        if "opacity" in element.properties or element.name.startswith("vertex")
     ]
     if len(candidates) == 1:
         return candidates[0]
-    names = [e.name for e in header.elements]
+    names = [element.name for element in header.elements]
     if not candidates:
         raise InputError(
             f"{header.path}: no vertex element, only {names}",
             "give a 3DGS PLY",
         )
     raise InputError(
-        f"{header.path}: {len(candidates)} models in one file: {[e.name for e in candidates]}",
+        f"{header.path}: {len(candidates)} models in one file: {[element.name for element in candidates]}",
         f"name one with element=, for example element={candidates[0].name!r}",
     )
 
@@ -400,7 +402,7 @@ class PlyHeader:
             if element.name == name:
                 return element
         raise InputError(
-            f"{self.path}, element {name!r}: no such element; the file has {[e.name for e in self.elements]}",
+            f"{self.path}, element {name!r}: no such element; the file has {[element.name for element in self.elements]}",
             "name one of the elements of the file",
         )
 

@@ -134,7 +134,10 @@ def balances(views: Sequence[PosedView], tracks: Tracks) -> F64:
     A view without points keeps 1.
     """
     patch_colours = np.array(
-        [_patch(views[v].rgb, at) for v, at in zip(tracks.view.tolist(), tracks.pixel, strict=True)]
+        [
+            _patch(views[view].rgb, pixel)
+            for view, pixel in zip(tracks.view.tolist(), tracks.pixel, strict=True)
+        ]
     ).reshape(-1, 3)
     out = np.ones((len(views), 3))
     for channel in range(3):

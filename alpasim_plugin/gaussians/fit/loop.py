@@ -95,7 +95,9 @@ def fit(
             if folder is not None and is_due:
                 run.save()
     background, actors = run.model.clouds()
-    gains = tuple((float(r), float(g), float(b)) for r, g, b in run.exposure.gains())
+    gains = tuple(
+        (float(red), float(green), float(blue)) for red, green, blue in run.exposure.gains()
+    )
     return Reconstruction(
         background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)), gains
     )

@@ -77,7 +77,7 @@ class SplatModel:
         """Take over a start's Gaussians; their colours are padded or cut to the degree."""
         names = tuple(sorted(start.actors))
         clouds = [start.background, *(start.actors[name] for name in names)]
-        moved = [clouds[0].means - origin, *(c.means for c in clouds[1:])]
+        moved = [clouds[0].means - origin, *(cloud.means for cloud in clouds[1:])]
         joined = GaussianCloud.concatenate(clouds)
         size = SH_SIZES[sh_degree]
         sh = np.zeros((len(joined), size, 3))
@@ -91,8 +91,8 @@ class SplatModel:
             "sh_dc": sh[:, :1],
             "sh_rest": sh[:, 1:],
         }
-        node = np.repeat(np.arange(len(clouds)), [len(c) for c in clouds])
-        tensors = {name: upload(a.astype(np.float32), device) for name, a in arrays.items()}
+        node = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
+        tensors = {name: upload(array.astype(np.float32), device) for name, array in arrays.items()}
         return cls(names, origin, tensors, torch.as_tensor(node))
 
     def __len__(self) -> int:
@@ -118,8 +118,8 @@ class SplatModel:
                     _harmonics(T[i, :3, :3].tobytes(), size),
                 )
         tensors = (
-            upload(a.astype(np.float32), self.device)
-            for a in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
+            upload(array.astype(np.float32), self.device)
+            for array in (T[:, :3, :3], T[:, :3, 3], quat, harmonics)
         )
         return Motion(torch.as_tensor(present), *tensors)
 
@@ -215,8 +215,14 @@ class RowAdam:
     """
 
     def __init__(self, params: Mapping[str, Tensor]) -> None:
-        self.first = {name: torch.zeros_like(p, requires_grad=False) for name, p in params.items()}
-        self.second = {name: torch.zeros_like(p, requires_grad=False) for name, p in params.items()}
+        self.first = {
+            name: torch.zeros_like(parameter, requires_grad=False)
+            for name, parameter in params.items()
+        }
+        self.second = {
+            name: torch.zeros_like(parameter, requires_grad=False)
+            for name, parameter in params.items()
+        }
         self.step = 0
 
     @torch.no_grad()
@@ -379,5 +385,7 @@ def densify(
 def _take(model: SplatModel, adam: RowAdam, rows: Tensor, old: int) -> None:
     model.node = model.node[rows]
     rows = upload(rows, model.device)
-    model.params = {name: p.detach()[rows].requires_grad_() for name, p in model.params.items()}
+    model.params = {
+        name: parameter.detach()[rows].requires_grad_() for name, parameter in model.params.items()
+    }
     adam.take(rows, old)

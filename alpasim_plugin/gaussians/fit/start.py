@@ -222,7 +222,7 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
     features = []
     for view in views:
         points, described = sift.detectAndCompute(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), None)
-        features.append((np.array([p.pt for p in points]).reshape(-1, 2) + 0.5, described))
+        features.append((np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, described))
     out = []
     for i in range(len(views)):
         for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(views))):
@@ -230,7 +230,8 @@ def matches(views: Sequence[PosedView]) -> list[Match]:
             if describes_i is None or describes_j is None or len(at_i) < 2 or len(at_j) < 2:
                 continue
             back = {
-                m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(describes_j, describes_i, k=1)
+                match.queryIdx: match.trainIdx
+                for (match,) in matcher.knnMatch(describes_j, describes_i, k=1)
             }
             for best, second in matcher.knnMatch(describes_i, describes_j, k=2):
                 if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx:

@@ -26,9 +26,9 @@ def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:
 def actors_at(actors: Iterable[Actor], t_us: int) -> dict[str, F64]:
     """Return the poses ``(4, 4)`` of the actors present at a time, by id."""
     return {
-        a.actor_id: interpolate(a.track, t_us)
-        for a in actors
-        if a.track.t_us[0] <= t_us <= a.track.t_us[-1]
+        actor.actor_id: interpolate(actor.track, t_us)
+        for actor in actors
+        if actor.track.t_us[0] <= t_us <= actor.track.t_us[-1]
     }
 
 

@@ -182,7 +182,7 @@ def _upsample(grid: FloatArray, height: int, width: int) -> F32:
 
 def make_sky(kind: Kind, rng: np.random.Generator) -> Sky:
     """Paint a sky with drifting clouds, a hazy horizon and a line of hills."""
-    zenith, middle, horizon, ground, cloud, hills = (np.array(c) for c in _COLOURS[kind])
+    zenith, middle, horizon, ground, cloud, hills = (np.array(colour) for colour in _COLOURS[kind])
     elevation = np.linspace(HIGH_RAD, LOW_RAD, HEIGHT)
     up = np.clip(elevation / HIGH_RAD, 0, 1)
     t = np.clip(up / 0.35, 0, 1)[:, None]

@@ -345,7 +345,10 @@ def demonstrations_digest(demonstrations: Sequence[Demonstrations]) -> str:
     order.
     """
     return hashlib.blake2b(
-        json.dumps([one.info for one in demonstrations], sort_keys=True).encode(), digest_size=8
+        json.dumps(
+            [demonstration.info for demonstration in demonstrations], sort_keys=True
+        ).encode(),
+        digest_size=8,
     ).hexdigest()
 
 
@@ -358,7 +361,7 @@ def common_views(demonstrations: Sequence[Demonstrations]) -> tuple[View, ...]:
     first = demonstrations[0]
     for demonstration in demonstrations:
         if demonstration.views != first.views:
-            have, has = ([view.name for view in each.views] for each in (first, demonstration))
+            have, has = ([view.name for view in member.views] for member in (first, demonstration))
             raise InputError(
                 f"{first.folder} has the views {have}, and {demonstration.folder} {has}",
                 "train on scenes whose cameras show the same views",
@@ -383,4 +386,6 @@ def read_demonstrations(root: Path, split: str) -> Sequence[Demonstrations]:
             f"{root / split}: no complete scene",
             "write some with 'simrun train policy-data'",
         )
-    return [one for one in map(Demonstrations, folders) if len(one)]
+    return [
+        demonstrations for demonstrations in map(Demonstrations, folders) if len(demonstrations)
+    ]

@@ -324,7 +324,7 @@ def write_bundle(
     path = folder / BUNDLE_FILE
     _write_weights(run, stage, path, averaged, updates, schedule)
     rows, hours = curves(folder / LOG_FILE)
-    trained = {part: asdict(own) for part, own in stage.trained.items()}
+    trained = {part: asdict(settings) for part, settings in stage.trained.items()}
     training = {
         "about": recipe.about,
         "schedule": asdict(schedule),

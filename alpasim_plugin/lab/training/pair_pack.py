@@ -91,9 +91,9 @@ def write_pack(folders: Sequence[Path], path: Path, limit_bytes: int = LIMIT_BYT
             raise InputError(f"{path}: room for none of {len(folders)} sequences", MAKE)
     psnrs = [info[PACKED]["psnr_db"] for info in infos]
     means = {
-        name: round(float(np.mean([one[name] for one in psnrs if name in one])), 2)
+        name: round(float(np.mean([row[name] for row in psnrs if name in row])), 2)
         for name in (*IMAGES, *SHARES)
-        if any(name in one for one in psnrs)
+        if any(name in row for row in psnrs)
     }
     frames = sum(info["frames"] for info in infos)
     left_out = len(folders) - len(infos)
@@ -120,10 +120,10 @@ def unpack(path: Path, folder: Path) -> Path:
             restore_folder(folder / split / sequence)
             if not (folder / split / sequence / SEQUENCE_FILE).exists():
                 start = f"{split}/{sequence}/"
-                files = {one.removeprefix(start): one for one in names if one.startswith(start)}
+                files = {name.removeprefix(start): name for name in names if name.startswith(start)}
                 size = sum(archive.getinfo(entry).file_size for entry in files.values())
                 SEQUENCE_BYTES.check(size, f"{path}, {start}")
-                contents = {one: archive.read(entry) for one, entry in files.items()}
+                contents = {name: archive.read(entry) for name, entry in files.items()}
                 _decode(contents, folder / split / sequence)
     return folder
 

@@ -91,7 +91,7 @@ class PolicyTask:
         self, net: LearnedNet, demonstrations: Sequence[Demonstrations], recipe: PolicyRecipe
     ) -> None:
         self.net, self.demonstrations, self.recipe = net, demonstrations, recipe
-        self.ends = np.cumsum([len(one) for one in demonstrations])
+        self.ends = np.cumsum([len(demonstration) for demonstration in demonstrations])
         device = next(net.parameters()).device
         self.weights = upload(knot_weights(), device).float()
         knots_m = upload(KNOTS_M, device)
@@ -102,7 +102,7 @@ class PolicyTask:
     def facts(self) -> dict[str, Any]:
         """Identify the training data and recipe."""
         return {
-            "scenes": [one.folder.name for one in self.demonstrations],
+            "scenes": [demonstration.folder.name for demonstration in self.demonstrations],
             "samples": int(self.ends[-1]),
             "data": demonstrations_digest(self.demonstrations),
             "recipe": asdict(self.recipe),

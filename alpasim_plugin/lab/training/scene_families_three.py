@@ -77,7 +77,9 @@ def _junction(rng: Rng, time_s: float, turn: str, sides: tuple[Side, ...]) -> Sp
         places: list[tuple[float, float]] = []  # along y at 0 and 20 s, in the direction of travel
         if share < 0.7:
             late_s = [first_s + i * headway_s for i in range(4)] if share < 0.5 else [alone_s]
-            places = [(u * (0 - meets_s - one), u * (20 - meets_s - one)) for one in late_s]
+            places = [
+                (u * (0 - meets_s - delay_s), u * (20 - meets_s - delay_s)) for delay_s in late_s
+            ]
         elif share < 0.8:
             places = [(-(corner_m + width_m + 4.0),) * 2]
         for i, (begins_m, ends_m) in enumerate(places):

@@ -249,11 +249,11 @@ class TrainingStreams:
         """Return the batch of update ``i``, counted from 0; of some slots, or of all."""
         chosen = range(self.batch) if slots is None else slots
         episodes = [self.episode_of(slot, i) for slot in chosen]
-        samples = [self._show(episode, at) for episode, at in episodes]
+        samples = [self._show(episode, index) for episode, index in episodes]
         render, opacity, sdmap, target, references, users = (
             torch.from_numpy(np.stack(arrays)) for arrays in zip(*samples, strict=True)
         )
-        fresh = torch.tensor([at == 0 or i == 0 for _, at in episodes])
+        fresh = torch.tensor([index == 0 or i == 0 for _, index in episodes])
         return StreamBatch(
             render,
             opacity,

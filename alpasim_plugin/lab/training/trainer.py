@@ -180,11 +180,15 @@ class Trainer(Generic[Batch]):
             (name, part, _parameters_of(name, self.parameters)) for name, part in parts.items()
         ]
         if nobodys := sorted(
-            set(self.parameters) - {key for _, _, own in self._parts for key in own}
+            set(self.parameters) - {key for _, _, parameters in self._parts for key in parameters}
         ):
             problem = listed("trained without a schedule", nobodys)
             raise InputError(f"{folder}: {problem}", "freeze them, or name their part")
-        groups = [group for _, part, own in self._parts for group in _groups(part, own, schedule)]
+        groups = [
+            group
+            for _, part, parameters in self._parts
+            for group in _groups(part, parameters, schedule)
+        ]
         self.optimiser = torch.optim.AdamW([g for g in groups if g["params"]], lr=schedule.peak_lr)
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
         self.step = 0
@@ -273,7 +277,7 @@ class Trainer(Generic[Batch]):
         """Write the checkpoint, in the first process; the others wait for it."""
         carried = self._kept
         if self.ranks > 1:
-            carried = {name: rows_of_all(own, self.ranks) for name, own in carried.items()}
+            carried = {name: rows_of_all(rows, self.ranks) for name, rows in carried.items()}
         if self.rank == 0:
             self._write(carried)
         if self.ranks > 1:

@@ -73,7 +73,7 @@ class RolloutState:
     @property
     def action(self) -> Action:
         """Return what completes the rollout: nothing, scoring its log, or driving."""
-        if self.manifest is None or any(one.file not in DERIVED for one in self.damage):
+        if self.manifest is None or any(damage.file not in DERIVED for damage in self.damage):
             return "drive"
         return "score" if self.damage else "none"
 

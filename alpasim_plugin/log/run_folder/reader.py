@@ -106,7 +106,7 @@ class Run:
         if os.path.exists(table_path(root, SUMMARY)):
             return cls.read(root)
         inspection = inspect_run(root)
-        damaged = {one.cell for one in inspection.damage}
+        damaged = {damage.cell for damage in inspection.damage}
         with parsing(root, AGAIN, "manifests from which no table can be made"):
             whole = [manifest for manifest in inspection.manifests if manifest.path not in damaged]
             table = rollout_table(whole)
@@ -126,22 +126,22 @@ class Run:
     @property
     def renderers(self) -> list[str]:
         """List renderers in the order of the command."""
-        return _in_order(self.info.renderers, (r.renderer for r in self._named))
+        return _in_order(self.info.renderers, (rollout.renderer for rollout in self._named))
 
     @property
     def policies(self) -> list[str]:
         """List policies in the order of the command."""
-        return _in_order(self.info.policies, (r.policy for r in self._named))
+        return _in_order(self.info.policies, (rollout.policy for rollout in self._named))
 
     @property
     def scenes(self) -> list[str]:
         """List scene ids in the order of ``run.json``."""
-        return _in_order(self.info.scenes, (r.scene for r in self._named))
+        return _in_order(self.info.scenes, (rollout.scene for rollout in self._named))
 
     def rollouts_of(self, variant: str) -> list[Rollout]:
         """List the rollouts of a summary key: a renderer's name, or `Rollout.variant`."""
-        return [r for r in self.rollouts if r.variant == variant] or [
-            r for r in self.rollouts if r.renderer == variant
+        return [rollout for rollout in self.rollouts if rollout.variant == variant] or [
+            rollout for rollout in self.rollouts if rollout.renderer == variant
         ]
 
     @cached_property
