@@ -126,9 +126,7 @@ def side_fault(plans: Mapping[str, Sequence[Plan]]) -> str:
     by_m = {"route": _end_m(plans[ROUTE_LEFT.name], plans[STRAIGHT.name])}
     if {situation.name for situation in IMAGES} <= plans.keys():
         by_m["image"] = _end_m(plans[IMAGE_LEFT.name], plans[NO_ROUTE.name])
-    mirrored = " and the ".join(
-        offset for offset, distance_m in by_m.items() if distance_m < -LEAST_M
-    )
+    mirrored = " and the ".join(source for source, left_m in by_m.items() if left_m < -LEAST_M)
     if mirrored:
         return f"where the {mirrored} alone bends left the plan leads further right: it is read mirrored, or y does not point left"
     left_m, right_m = (_end_m(plans[road.name]) for road in (LEFT, RIGHT))
@@ -490,11 +488,7 @@ def _checked(policy: Policy, scenario: Scenario, place: Place, looked_up: set[st
     plans: dict[str, list[Plan]] = {}
     plan_checks: list[Check] = []
     if place.recording is None or not (replays or looked_up):
-        situations = [STRAIGHT, OLD_FRAME]
-        if not replays:
-            situations += [LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK]
-            situations += IMAGES if used else ()
-        plans, plan_checks = drives.plans_in(situations)
+        plans, plan_checks = drives.plans_in(_situations(replays, has_cameras=bool(used)))
     follows_scene = place.recording is not None and (replays or bool(looked_up))
     if follows_scene:
         drives = replace(drives, durations_ms=[])
@@ -510,12 +504,22 @@ def _checked(policy: Policy, scenario: Scenario, place: Place, looked_up: set[st
             checks += way_checks
     if follows_scene:
         notes = (Check("recording", True, _followed(looked_up)),)
-    latency_ms = (0.0, 0.0)
-    if drives.durations_ms:
-        latency_ms = (float(np.median(drives.durations_ms)), max(drives.durations_ms))
-        sentence = f"plans in {latency_ms[0]:.1f} ms, the limit is {LATENCY_MS:.0f} ms"
-        checks.append(Check("latency", latency_ms[0] <= LATENCY_MS, sentence))
-    return Report(tuple(checks), notes, latency_ms)
+    if not drives.durations_ms:
+        return Report(tuple(checks), notes, (0.0, 0.0))
+    median_ms = float(np.median(drives.durations_ms))
+    sentence = f"plans in {median_ms:.1f} ms, the limit is {LATENCY_MS:.0f} ms"
+    checks.append(Check("latency", median_ms <= LATENCY_MS, sentence))
+    return Report(tuple(checks), notes, (median_ms, max(drives.durations_ms)))
+
+
+def _situations(replays: bool, has_cameras: bool) -> list[Situation]:
+    """Return the situations on roads of our own: all of them for a policy that plans, and for one
+    that replays a recording those without a bend.
+    """
+    if replays:
+        return [STRAIGHT, OLD_FRAME]
+    roads = [STRAIGHT, OLD_FRAME, LEFT, RIGHT, ROUTE_LEFT, STANDING, LONG, BLANK]
+    return [*roads, *IMAGES] if has_cameras else roads
 
 
 def _followed(looked_up: Collection[str]) -> str:

@@ -187,19 +187,18 @@ def _sort_cells(
     originals: dict[tuple[str, str, int], Cell] = {}
     for cell in plan.cells:
         action, state = find_rollout_state(cell, root, how.reuse_undigested, plan.options.video)
+        manifest = state.manifest
         original = cell
         if cell.policy.is_blind:
             original = originals.setdefault((cell.policy.name, cell.scene, cell.seed), cell)
         if state.damage:
             notify(f"damaged: {'; '.join(map(str, state.damage))}; it is made again")
-        # None where it is still to be driven
-        driven = work.manifests.get(original.folder)
-        if original is not cell and (driven is None or is_copied(driven)):
-            copied_from = state.manifest and state.manifest.copied_from
-            if driven is None or action != "none" or copied_from != driven.path:
+        if original is not cell:
+            # None where it is still to be driven
+            driven = work.manifests.get(original.folder)
+            if _is_copied_anew(driven, manifest, action):
                 work.copies.append((cell, original))
                 continue
-        manifest = state.manifest
         if action == "drive" or manifest is None:
             if cell.policy.name in hanging:
                 error = PolicyError(hanging[cell.policy.name], NOT_DRIVEN)
@@ -221,6 +220,22 @@ def _sort_cells(
         work.manifests[cell.folder] = replace(manifest, reused=True)
         on_done(manifest, True)
     return work
+
+
+def _is_copied_anew(driven: Manifest | None, copy: Manifest | None, action: str) -> bool:
+    """Tell whether the rollout of a policy that sees nothing is copied from that behind another
+    renderer, in place of what the folder holds.
+
+    Args:
+        driven: The rollout to copy; None where it is still to be driven.
+        copy: What the folder holds.
+        action: What the folder's rollout would need.
+    """
+    if driven is None:
+        return True
+    if not is_copied(driven):
+        return False
+    return action != "none" or copy is None or copy.copied_from != driven.path
 
 
 def _rescored(cell: Cell, plan: RunPlan, root: Path, manifest: Manifest, how: HowToRun) -> Manifest:

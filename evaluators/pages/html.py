@@ -145,15 +145,7 @@ def context(run: Run) -> dict[str, Any]:
     looked_at = interesting[: 2 * MAX_SCENE_PLOTS]
     series = series_by_rollout(run.steps(SERIES, looked_at)) if looked_at else {}
     views, no_view = scene_views(run, series, looked_at, variant_of)
-    rows = tables.metric_rows(run.summary, run.invalid_reasons, run.table)
-    pairs = tables.pair_rows(run.summary.differences, run.table)
-    # every column has the colour of its renderer, or of its policy where there is one renderer
-    colours = {}
-    for i, variant in enumerate(run.variants):
-        first = next(iter(run.rollouts_of(variant)), None)
-        colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
     by_policy = len(run.renderers) == 1 and len(run.policies) > 1
-    flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
     return {
         "run": run,
         "title": ", ".join(run.renderers) or "empty run",
@@ -168,20 +160,12 @@ def context(run: Run) -> dict[str, Any]:
         "boundary": boundary_section(run.summary.boundary),
         "gate": gate_section(run),
         "columns": tables.columns(run),
-        "variant_colour": colours,
-        "flips": flips,
-        "whys": {
-            rollout.path: page
-            for rollout in run.rollouts
-            if rollout.ok and outcomes_of(rollout) and (page := run.href(rollout, WHY_NAME))
-        },
-        "more_flips": more_flips,
-        "n_flips": len(flips) + more_flips,
+        "variant_colour": column_colours(run, variant_of),
+        **flip_section(run),
+        "whys": why_pages(run),
         "n_invalid": sum(len(ledger.invalid) for ledger in run.summary.censoring.values()),
-        "flip_pairs": flip_pairs,
-        "baseline": " or ".join(base.name for base in flip_bases(run)),
-        "metric_rows": rows,
-        "pair_rows": pairs,
+        "metric_rows": tables.metric_rows(run.summary, run.invalid_reasons, run.table),
+        "pair_rows": tables.pair_rows(run.summary.differences, run.table),
         "coloured": run.policies if by_policy else run.renderers,
         "dashed": len(run.policies) > 1 and not by_policy,
         "policies": run.policies,
@@ -201,6 +185,43 @@ def context(run: Run) -> dict[str, Any]:
         "commit": _commit(run.info.project),
         "options": json_of(run.info.config),
     }
+
+
+def column_colours(
+    run: Run, variant_of: Mapping[tuple[str, str], tuple[int, int]]
+) -> dict[str, int]:
+    """Return the colour of every column: its renderer's, or its policy's where there is one
+    renderer.
+    """
+    colours = {}
+    for i, variant in enumerate(run.variants):
+        first = next(iter(run.rollouts_of(variant)), None)
+        colours[variant] = i if first is None else variant_of[first.renderer, first.policy][0]
+    return colours
+
+
+def flip_section(run: Run) -> dict[str, Any]:
+    """Return what the template prints of changed outcomes: as many as fit, and how many there are."""
+    flips, more_flips, flip_pairs = flip_rows(run, FLIP_BUDGET_BYTES)
+    return {
+        "flips": flips,
+        "more_flips": more_flips,
+        "n_flips": len(flips) + more_flips,
+        "flip_pairs": flip_pairs,
+        "baseline": " or ".join(base.name for base in flip_bases(run)),
+    }
+
+
+def why_pages(run: Run) -> dict[str, str]:
+    """Return the address of the page that says why, of each rollout that has an outcome and a
+    page.
+    """
+    pages = {
+        rollout.path: run.href(rollout, WHY_NAME)
+        for rollout in run.rollouts
+        if rollout.ok and outcomes_of(rollout)
+    }
+    return {path: page for path, page in pages.items() if page}
 
 
 def _commit(project: Project | None) -> str:

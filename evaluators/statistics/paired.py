@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.types import F64, Bool
+from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.sides import (
     Cell,
     RolloutTable,
@@ -296,27 +296,51 @@ def measure(
     )
     if len(means) < 2:
         return replace(entry, reason=f"needs at least two scenes, found {len(means)}")
+    return _bounded(_tested(entry, means, metric), delta, means, pairs.scenes, metric)
+
+
+def _tested(entry: Difference, means: F64, metric: MetricInfo) -> Difference:
+    """Add the test of a difference of zero over scenes, what it claims, and how far the means
+    ``(G,)`` spread; where values are cut at a reach, mean and spread are those of the cut ones.
+    """
     p_value, test = sign_flip(means)
-    claim = claim_of(metric, margin)
+    claim = claim_of(metric, entry.margin)
     counted = means
     if claim is not None:
-        reach = reach_of(metric, margin)
+        reach = reach_of(metric, entry.margin)
         counted = np.clip(means, -reach, reach)
     small, scale = scaled(counted)
-    interval, guarded = difference_bounds(delta, means, pairs.scenes, metric, margin)
-    bounds = within(interval, *metric.difference_range).bounds
-    entry = replace(
+    return replace(
         entry,
         p_value=p_value,
         test=test,
         claim=claim,
         cut_mean=None if claim is None else mean_of(counted),
         spread=scale * float(np.std(small, ddof=1)),
+        beyond=beyond_of(means, metric, entry.margin),
+    )
+
+
+def _bounded(
+    entry: Difference, delta: F64, means: F64, scenes: I64, metric: MetricInfo
+) -> Difference:
+    """Add the interval of a difference, or the reason why it has none.
+
+    Args:
+        entry: The difference.
+        delta: ``(n,)`` differences of the cells.
+        means: ``(G,)`` their means over each scene.
+        scenes: ``(n,)`` numbers of the cells' scenes.
+        metric: What is compared.
+    """
+    interval, guarded = difference_bounds(delta, means, scenes, metric, entry.margin)
+    bounds = within(interval, *metric.difference_range).bounds
+    entry = replace(
+        entry,
         ci95=_pair_of(bounds),
         method=interval.method or None,
         guarded=_pair_of(guarded),
         note=interval.note or None,
-        beyond=beyond_of(means, metric, margin),
     )
     if bounds is None:
         return replace(entry, reason=interval.reason, note=None)
