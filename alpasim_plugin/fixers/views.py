@@ -202,6 +202,15 @@ def _stack(
     index: dict[str, list[int]],
     on_device: bool,
 ) -> Views:
+    """Stack the frames of cameras of one size.
+
+    Args:
+        block: All frames.
+        maps: Semantic maps of the same frames, or empty.
+        cameras: The cameras.
+        index: Camera -> positions of its frames in the block, oldest first.
+        on_device: Whether planes stay on the device if it drew all of these frames.
+    """
     names = tuple(sorted(cameras))
     order = tuple(tuple(index[name]) for name in names)
     flat = [i for indices in order for i in indices]
@@ -236,6 +245,7 @@ def _stack(
 
 
 def _references(frame: Frame) -> Sequence[U8]:
+    """Return the references of a frame on the host, also those of a frame that a device drew."""
     planes = frame.pending
     if planes is None or planes.references is None:
         return frame.references

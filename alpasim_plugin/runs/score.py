@@ -92,8 +92,8 @@ def execute_score(
         root: Run folder; None makes one below ``runs/`` named after content and preset.
         command: The command line, for run.json.
         on_done: Called with each log's manifest.
-        noticed: Called with one line that says what is another one in the evaluators than when the
-            same command scored into the folder before.
+        noticed: Called with one line that names the evaluators which have changed since the same
+            command scored into the folder, if any have.
 
     Raises:
         InputError: The folder holds other results, or a log's scene is not among ``scenes``.

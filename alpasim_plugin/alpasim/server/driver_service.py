@@ -34,11 +34,11 @@ from alpasim_plugin.core.plan_check import blank_scenario, plan_problem, sensors
 from alpasim_plugin.core.printing import warn
 from alpasim_plugin.core.types import (
     F64,
+    I64,
     CameraSpec,
     EgoState,
     Frame,
     Observation,
-    Plan,
     Route,
     Scenario,
     Trajectory,
@@ -49,7 +49,8 @@ from alpasim_plugin.log.wire import api_version, common_pb2, egodriver_pb2, sens
 
 ADDRESS = "SIMRUN_POLICY_ADDRESS"
 ROUTE_POINTS = 20
-# AlpaSim sends zero speeds until it hands over; faster motion than this is believed against them
+# AlpaSim sends zero speeds until it hands over; where the poses move faster than this, their own
+# speed is taken instead
 MOVING_MPS = 0.3
 SPEED_WINDOW_US = 200_000
 MOST_POSES = 8192  # of a session's motion; the oldest are forgotten
@@ -177,7 +178,7 @@ class Driving:
     newest `MOST_POSES` of the motion. Images are decoded when the policy is asked.
 
     Args:
-        request: That opened it.
+        request: The call that opened it: seed and cameras.
         scenario: What a policy is made for; its cameras are replaced by the session's.
         make: Makes the policy for a scenario.
     """
@@ -307,12 +308,12 @@ class Driving:
                     f"{type(policy).__name__}: {problem}",
                     "simrun check policy finds all faults of a policy",
                 )
-            wires = [
-                _absolute(plan, xy_yaw, ego.T_world_rig)
+            trajectory, *samples = (
+                _in_world(plan.times_us, xy_yaw, ego.T_world_rig)
                 for xy_yaw in (np.column_stack([plan.xy, plan.yaw]), *plan.samples)
-            ]
-            debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=wires[1:])
-            return egodriver_pb2.DriveResponse(trajectory=wires[0], debug_info=debug)
+            )
+            debug = egodriver_pb2.DriveResponse.DebugInfo(sampled_trajectories=samples)
+            return egodriver_pb2.DriveResponse(trajectory=trajectory, debug_info=debug)
 
     def close(self) -> None:
         """Give back what the policy holds."""
@@ -352,27 +353,30 @@ class Driving:
         return policy
 
     def _ego(self) -> EgoState:
+        """Return the ego at its newest pose, with the motion that the caller states; where that has
+        no speed and the poses move, with the speed and the turn of the last `SPEED_WINDOW_US`.
+        """
         history = self._history
         now = int(self._history.t_us[-1])
         pose = se3(history.xyz[-1], history.quat[-1])
-        stated = 0.0
-        turn = 0.0
+        speed_mps = 0.0
+        yaw_rate = 0.0
         accel = 0.0
         if self._state is not None:
-            stated = self._state.linear_velocity.x
-            turn = self._state.angular_velocity.z
+            speed_mps = self._state.linear_velocity.x
+            yaw_rate = self._state.angular_velocity.z
             accel = self._state.linear_acceleration.x
         earlier = max(
             int(np.searchsorted(history.t_us, now - SPEED_WINDOW_US, side="right")) - 1, 0
         )
         dt_s = (now - int(history.t_us[earlier])) * 1e-6
-        if stated == 0.0 and dt_s > 0:
+        if speed_mps == 0.0 and dt_s > 0:
             before = se3(history.xyz[earlier], history.quat[earlier])
             measured_mps = float((history.xyz[-1] - before[:3, 3]) @ pose[:3, 0]) / dt_s
             if abs(measured_mps) > MOVING_MPS:
-                stated = measured_mps
-                turn = float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
-        return EgoState(now, pose, float(stated), float(accel), float(turn))
+                speed_mps = measured_mps
+                yaw_rate = float(wrap_angle(yaw_of(pose) - yaw_of(before))) / dt_s
+        return EgoState(now, pose, float(speed_mps), float(accel), float(yaw_rate))
 
 
 def check_time(t_us: int, call: str) -> None:
@@ -381,7 +385,15 @@ def check_time(t_us: int, call: str) -> None:
         raise InputError(f"{call}: {t_us} us", "send a time below 2^62 microseconds")
 
 
-def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
+def _in_world(times_us: I64, rows: F64, T_world_rig: F64) -> Any:
+    """Return a trajectory in the rig's frame as AlpaSim's message, in the world's and at the rig's
+    height.
+
+    Args:
+        times_us: ``(T,)``, microseconds.
+        rows: ``(T, 3)`` x and y in metres, and yaw in radians.
+        T_world_rig: Pose of the rig ``(4, 4)``.
+    """
     yaw0 = yaw_of(T_world_rig)
     origin = T_world_rig[:3, 3]
     c = np.cos(yaw0)
@@ -389,19 +401,19 @@ def _absolute(plan: Plan, rows: F64, T_world_rig: F64) -> Any:
     xy = rows[:, :2] @ np.array([[c, s], [-s, c]]) + origin[:2]
     xyz = np.column_stack([xy, np.full(len(rows), origin[2])])
     return wire_trajectory(
-        Trajectory(plan.times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan"
+        Trajectory(times_us, xyz, quat_from_yaw(wrap_angle(rows[:, 2] + yaw0))), "the plan"
     )
 
 
-def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
+def _native(cameras: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.AvailableCamera]:
     """Return the session's cameras, of any lens that `straight_of` takes.
 
     Raises:
         InputError: An invalid lens or camera pose, or too many cameras.
     """
-    if len(listed) > MOST_CAMERAS:
-        raise InputError(f"start_session: {len(listed)} cameras", f"name at most {MOST_CAMERAS}")
-    for camera in listed:
+    if len(cameras) > MOST_CAMERAS:
+        raise InputError(f"start_session: {len(cameras)} cameras", f"name at most {MOST_CAMERAS}")
+    for camera in cameras:
         try:
             straight_of(
                 camera.intrinsics, camera.intrinsics.resolution_w, camera.intrinsics.resolution_h
@@ -412,7 +424,7 @@ def _native(listed: Any) -> dict[str, sensorsim_pb2.AvailableCamerasReturn.Avail
                 "give the driver a pinhole view of it: runtime.extra_cameras in AlpaSim, or a renderer that serves pinholes",
             ) from error
         read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
-    return {camera.logical_id: camera for camera in listed}
+    return {camera.logical_id: camera for camera in cameras}
 
 
 def serve_policy(factory: Callable[..., Any], address: str | None = None) -> None:
@@ -460,6 +472,7 @@ class _Serving(DriverService):
 
 
 def _unknown_scene(scene_id: str) -> Scenario:
+    """Return what a served policy is made for where only the session's cameras are known."""
     standing = Trajectory(
         np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
     )

@@ -58,9 +58,8 @@ class Fields:
         if not unread:
             return ()
         frequent = sorted(unread, key=lambda name: (-unread[name], name))
-        listed = ", ".join(f"{name} ({unread[name]})" for name in frequent[:MOST_NAMED])
-        more = len(frequent) - MOST_NAMED
-        return (f"{self.form}: not read are {listed}" + (f" and {more} more" if more > 0 else ""),)
+        listed = [f"{name} ({unread[name]})" for name in frequent]
+        return (f"{self.form}: not read are {some_of(listed, MOST_NAMED)}",)
 
     def notes_of_xml(self, root: Element) -> tuple[str, ...]:
         """Return `notes` on an XML document; what stands in an element that is not read is not
@@ -104,6 +103,7 @@ class Fields:
         return _pattern(_names(self.moving))
 
     def _met_below(self, element: Element, read: frozenset[str]) -> Iterator[str]:
+        """Give the names of what stands in an element, and in those elements of it that are read."""
         for attribute in element.attrib:
             yield field_name(element.tag, f"@{attribute}")
         for child in element:

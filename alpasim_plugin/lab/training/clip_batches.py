@@ -102,7 +102,7 @@ class Drawn(NamedTuple):
 
 
 class ClipBatches:
-    """Draws of clips.
+    """Batches of clips, each drawn by its number.
 
     Args:
         clips: Training latents.
@@ -120,8 +120,8 @@ class ClipBatches:
     def __getitem__(self, index: int) -> Drawn:
         """Draw batch ``index``: a function of the index and the seed only.
 
-        Equal clips, crops and noise for every recipe of the same form, so that recipes are compared
-        on the same draws.
+        Every recipe of the same form gets equal clips, crops and noise, so that recipes are
+        compared on the same draws.
         """
         form = self.form
         rng = stream("training", form.seed, "generator.clips", index)
@@ -167,11 +167,12 @@ class ClipBatches:
         return Sample(s.z_r, s.z_0, condition, m, s.eps, s.eps_context, s.t, s.t_redenoise, s.w)
 
     def _columns(self, rng: np.random.Generator, width: int) -> slice:
-        wanted = self.form.columns
-        if wanted is None or wanted >= width:
+        """Draw the columns of the crop in latents, whole tokens, of an image ``width`` latents wide."""
+        columns = self.form.columns
+        if columns is None or columns >= width:
             return slice(0, width)
-        left = PATCH * int(rng.integers((width - wanted) // PATCH + 1))
-        return slice(left, left + wanted)
+        left = PATCH * int(rng.integers((width - columns) // PATCH + 1))
+        return slice(left, left + columns)
 
 
 @torch.no_grad()
