@@ -89,7 +89,7 @@ def gate(
     says, before anything is driven, whether its scenes are enough for the gate.
     """
     if self_test:
-        if runs or baseline_file is not None or approve is not None:
+        if runs or baseline_file or approve:
             raise InputError(
                 "--self-test: a run or baseline is named", "Give --gate and --out only."
             )
@@ -108,7 +108,22 @@ def gate(
     verdict = _verdict(run, spec, source, baseline_file)
     if absent is not None:
         verdict = verdict.with_outcome(Outcome("incomplete", (absent,)))
-    folder = out if run.folders else out or run.folder
+    _publish(verdict, source, run, out if run.folders else out or run.folder, as_json)
+    raise typer.Exit(verdict.exit_code)
+
+
+def _publish(
+    verdict: GateVerdict, source: str, run: Run, folder: Path | None, as_json: bool
+) -> None:
+    """Write the files of a verdict, show it in the pages of the run if they lie there, and print it.
+
+    Args:
+        verdict: The verdict.
+        source: The gate's name.
+        run: What it is about.
+        folder: Where the files go; None: nothing is written of several runs.
+        as_json: Whether to print JSON.
+    """
     files = write_gate_files(verdict, source, run, folder)
     if folder == run.folder:
         _show_in_pages(run.folder)
@@ -117,7 +132,6 @@ def gate(
     if folder is None:
         lines.append("gate.md and gate.junit.xml of several runs are written with --out FOLDER")
     show(as_json, facts, *lines)
-    raise typer.Exit(verdict.exit_code)
 
 
 def _show_in_pages(folder: Path) -> None:

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, Series
 from alpasim_plugin.log.run_folder.schema import VIDEO_NAME, WHY_NAME
 from evaluators.metrics.outcomes import (
@@ -200,7 +201,25 @@ def rollout_block(run: Run) -> RolloutBlock:
     rollouts = run.rollouts[:MAX_ROLLOUTS]
     had = [outcomes_of(rollout) for rollout in rollouts]
     kinds = [name for name in OUTCOMES if any(name in names for names in had)]
-    texts = {
+    texts = _texts(rollouts)
+    by_policy = len(run.renderers) == 1 and len(run.policies) > 1
+    document = {
+        "coloured": ["policy", run.policies] if by_policy else ["renderer", run.renderers],
+        "kinds": [[name, OUTCOMES[name].words] for name in kinds],
+        "endings": [name for name in ENDINGS if name in texts["ending"]],
+        "texts": texts,
+        "had": [sum(1 << kinds.index(name) for name in names) for names in had],
+        "state": [_state(run, rollout) for rollout in rollouts],
+        "numbers": _numbers(run, rollouts),
+    }
+    plain = json.dumps(document, separators=(",", ":")).encode()
+    data = base64.b64encode(gzip.compress(plain, mtime=0)).decode()
+    return RolloutBlock(data, len(rollouts), len(run.rollouts) - len(rollouts))
+
+
+def _texts(rollouts: Sequence[Rollout]) -> dict[str, list[str]]:
+    """Return the columns of text, by name."""
+    return {
         "scene": [rollout.scene for rollout in rollouts],
         "renderer": [rollout.renderer for rollout in rollouts],
         "policy": [rollout.policy for rollout in rollouts],
@@ -214,11 +233,16 @@ def rollout_block(run: Run) -> RolloutBlock:
         "tone": [_tone(rollout) for rollout in rollouts],
         "note": [_note(rollout)[:MAX_TEXT] for rollout in rollouts],
     }
-    walls: dict[str, Any] = {"name": "wall_s", "unit": "s"}
-    numbers = [walls | {"data": [_short(rollout.wall_s) for rollout in rollouts]}]
+
+
+def _numbers(run: Run, rollouts: Sequence[Rollout]) -> list[JsonObject]:
+    """Return the columns of numbers: the wall time, and the metrics in the order of the run."""
+    columns: list[JsonObject] = [
+        {"name": "wall_s", "unit": "s", "data": [_short(rollout.wall_s) for rollout in rollouts]}
+    ]
     for metric in run.table.ordered(run.metric_names):
         facts = run.table.shown(metric)
-        numbers.append(
+        columns.append(
             {
                 "name": metric,
                 "unit": facts.unit,
@@ -228,19 +252,7 @@ def rollout_block(run: Run) -> RolloutBlock:
                 "data": [_short(rollout.metrics.get(metric)) for rollout in rollouts],
             }
         )
-    by_policy = len(run.renderers) == 1 and len(run.policies) > 1
-    document = {
-        "coloured": ["policy", run.policies] if by_policy else ["renderer", run.renderers],
-        "kinds": [[name, OUTCOMES[name].words] for name in kinds],
-        "endings": [name for name in ENDINGS if name in texts["ending"]],
-        "texts": texts,
-        "had": [sum(1 << kinds.index(name) for name in names) for names in had],
-        "state": [_state(run, rollout) for rollout in rollouts],
-        "numbers": numbers,
-    }
-    plain = json.dumps(document, separators=(",", ":")).encode()
-    data = base64.b64encode(gzip.compress(plain, mtime=0)).decode()
-    return RolloutBlock(data, len(rollouts), len(run.rollouts) - len(rollouts))
+    return columns
 
 
 def _note(rollout: Rollout) -> str:

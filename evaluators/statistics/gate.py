@@ -630,18 +630,17 @@ def _of_suite(
         margin = named[name].margin_of(metric) if name in named else metric.accepted
         changes.append(change_of(pair.side, pair.base, metric, margin, stops))
     noises: Sequence[Noise | None] = [None] * len(changes)
-    is_equal = not any(change.harms[0].any() or change.is_cut.any() for change in changes)
-    if is_noisy and not is_equal:
+    if is_noisy and any(change.harms[0].any() or change.is_cut.any() for change in changes):
         noises = noises_of(changes, [rule.new_of(spec.max_new) for rule in rules.values()])
     checks = [
         _suite_check(pair, change, rule, noise, spec)
         for change, rule, noise in zip(changes, rules.values(), noises, strict=True)
     ]
-    if any(check.cause == "regression" for check in checks):
+    if _has_regression(checks):
         # It decides; the rollouts that it cut short need not be compared.
         checks = [replace(check, binding=check.binding and _is_compared(check)) for check in checks]
     named_checks = checks[: len(named)]
-    if any(check.cause == "regression" for check in named_checks):
+    if _has_regression(named_checks):
         return named_checks
     happened = [
         check
@@ -649,6 +648,10 @@ def _of_suite(
         if change.n_new > 0
     ]
     return named_checks + happened
+
+
+def _has_regression(checks: Sequence[Check]) -> bool:
+    return any(check.cause == "regression" for check in checks)
 
 
 def _is_compared(check: Check) -> bool:

@@ -159,6 +159,7 @@ def _of_renderer(
     side = Side.of([RolloutValues.of_manifest(manifest) for manifest in manifests])
     finished = [manifest for manifest in manifests if manifest.ok]
     ledgers = [manifest.censored for manifest in finished if manifest.censored is not None]
+    steps = _summed(ledgers)
     events: Counter[str] = Counter()
     for manifest in finished:
         events.update(manifest.frame_events)
@@ -171,11 +172,11 @@ def _of_renderer(
         rollouts=len(manifests),
         failed=dict(Counter(manifest.failure_class for manifest in manifests if not manifest.ok)),
         dropped=dict(Counter(ledger.dropped for ledger in ledgers if ledger.dropped)),
-        steps_total=sum(ledger.steps_total for ledger in ledgers),
-        steps_warmup=sum(ledger.steps_warmup for ledger in ledgers),
-        steps_after_event=sum(ledger.steps_after_event for ledger in ledgers),
-        steps_after_drift=sum(ledger.steps_after_drift for ledger in ledgers),
-        steps_scored=sum(ledger.steps_scored for ledger in ledgers),
+        steps_total=steps.steps_total,
+        steps_warmup=steps.steps_warmup,
+        steps_after_event=steps.steps_after_event,
+        steps_after_drift=steps.steps_after_drift,
+        steps_scored=steps.steps_scored,
         frames=sum(manifest.frames or 0 for manifest in finished),
         frame_events=dict(events),
         frames_passed_raw=sum(n for event, n in events.items() if event.startswith(FIXER_GUARD)),
@@ -184,6 +185,18 @@ def _of_renderer(
         bounds_rollouts={name: limits.bounds_rollouts for name, limits in rates.items()},
         bounds_rollouts_ci95={name: limits.bounds_rollouts_ci95 for name, limits in rates.items()},
         cut={name: limits.n_cut for name, limits in rates.items()},
+    )
+
+
+def _summed(ledgers: Sequence[Ledger]) -> Ledger:
+    """Return the steps of all ledgers together."""
+    return Ledger(
+        steps_total=sum(ledger.steps_total for ledger in ledgers),
+        steps_warmup=sum(ledger.steps_warmup for ledger in ledgers),
+        steps_after_event=sum(ledger.steps_after_event for ledger in ledgers),
+        steps_after_drift=sum(ledger.steps_after_drift for ledger in ledgers),
+        steps_scored=sum(ledger.steps_scored for ledger in ledgers),
+        dropped="",
     )
 
 

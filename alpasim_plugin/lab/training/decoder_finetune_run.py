@@ -65,7 +65,7 @@ def finetune_decoder(
         InfrastructureError: The loss is not finite.
     """
     settings = bundle_settings(bundle)
-    parts = parts_of({key: value.float() for key, value in load_weights(bundle).items()})
+    parts = _float32_parts(bundle)
     vae = TinyVAE.from_state_dict(parts["vae"], source=str(bundle))
     generator = streaming_dit(parts["dit"], settings, str(bundle)).requires_grad_(False)
 
@@ -87,12 +87,17 @@ def finetune_decoder(
     trainer = Trainer(vae, out, schedule, task.batch, task.loss, facts)
     trainer.run(report)
 
-    note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
     path = out / BUNDLE_FILE
+    note = f"{read_metadata(bundle).get('note', '')}, decoder {schedule.steps} updates"
     weights = {"dit": _halves(parts["dit"]), "vae": _halves(trainer.averaged())}
     save_bundle(path, weights, settings, trained=True, note=note)
     _write_card(path, note, len(clips), form, schedule, facts)
     return path
+
+
+def _float32_parts(bundle: Path) -> dict[str, dict[str, Tensor]]:
+    """Return the tensors of each network of a bundle."""
+    return parts_of({name: tensor.float() for name, tensor in load_weights(bundle).items()})
 
 
 def _halves(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
