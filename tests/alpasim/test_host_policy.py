@@ -183,6 +183,23 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
         silence.over.set()
 
 
+def test_slow_senders_are_cancelled_soon_where_others_wait_for_their_places(monkeypatch):
+    monkeypatch.setattr(hosting, "RECEIVING", 4)
+    monkeypatch.setattr(hosting, "SENDING_S", 3600.0)
+    monkeypatch.setattr(hosting, "CROWDED_S", 0.2)
+    name = "SensorsimService"
+    silence = Silence()
+    with served(name) as host, channel_to(host) as channel:
+        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(4)]
+        time.sleep(0.5)  # all places are theirs
+        assert is_served(host, name)
+        # others wait no more, so that those who came last stay
+        assert failure(lambda: next(calls[0]))[0] is Code.CANCELLED
+        for call in calls:
+            call.cancel()
+        silence.over.set()
+
+
 class LargeImages:
     """A renderer whose images are 8 MiB."""
 

@@ -32,8 +32,9 @@ from alpasim_plugin.log.wire.services import MESSAGE_BYTES, V1ALPHA, Reflection,
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
-RECEIVING = 128  # calls whose message is in memory and that are not worked on yet
+RECEIVING = 32  # calls whose message is in memory and that are not worked on yet
 SENDING_S = 30.0  # a caller that has not sent its message after so long is cancelled
+CROWDED_S = 0.5  # the same where others wait for their places
 UNREAD_BYTES = 512 << 20  # of all answers that callers have not taken yet
 READING_S = 30.0  # a caller that has not taken its answer after so long is cancelled
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
@@ -385,11 +386,19 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def cancel_slow(self) -> None:
         """Cancel the calls that have not sent their message, or taken their answer, in time."""
-        latest_s = time.monotonic() - SENDING_S
+        self._cancel_senders(SENDING_S)
+        self._unread.cancel_slow()
+
+    def _cancel_senders(self, limit_s: float) -> None:
+        """Cancel the calls that have been sending their message for longer than a time."""
+        latest_s = time.monotonic() - limit_s
         for context, since_s in list(self._senders.items()):
             if since_s < latest_s:
                 context.cancel()
-        self._unread.cancel_slow()
+
+    def _make_room(self) -> None:
+        """Cancel slow senders earlier, because a call waits for a place of theirs."""
+        self._cancel_senders(CROWDED_S)
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -402,7 +411,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         left = CallTime(context)
         try:
             with ExitStack() as place:
-                with left.holding(self._receiving):
+                with left.holding(self._receiving, self._make_room):
                     request = self._received(messages, context)
                     place.enter_context(left.holding(self._working))
                 answer = call(request, context)

@@ -87,12 +87,22 @@ class CallTime:
         return left
 
     @contextmanager
-    def holding(self, lock: threading.Lock | threading.Semaphore) -> Iterator[None]:
-        """Hold a lock, or a place of a semaphore; waiting ends with the call's time."""
+    def holding(
+        self,
+        lock: threading.Lock | threading.Semaphore,
+        make_room: Callable[[], None] = lambda: None,
+    ) -> Iterator[None]:
+        """Hold a lock, or a place of a semaphore; waiting ends with the call's time.
+
+        Args:
+            lock: The lock.
+            make_room: Called again and again while there is no place.
+        """
         while True:
             left = self.left_s()
             if lock.acquire(timeout=POLL_S if left is None else min(left, POLL_S)):
                 break
+            make_room()
         try:
             yield
         finally:
