@@ -189,13 +189,20 @@ def test_slow_senders_are_cancelled_soon_where_others_wait_for_their_places(monk
     monkeypatch.setattr(hosting, "CROWDED_S", 0.2)
     name = "SensorsimService"
     silence = Silence()
-    with served(name) as host, channel_to(host) as channel:
-        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(4)]
-        time.sleep(0.5)  # all places are theirs
+    own = [("grpc.use_local_subchannel_pool", 1)]  # a connection of its own
+    with (
+        served(name) as host,
+        channel_to(host) as channel,
+        grpc.insecure_channel(host.address, own) as other,
+    ):
+        alone = say_nothing(name, "get_version")(other, silence)
+        time.sleep(0.5)  # it is the first
+        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(3)]
+        time.sleep(0.5)  # all places are taken
         assert is_served(host, name)
-        # others wait no more, so that those who came last stay
         assert failure(lambda: next(calls[0]))[0] is Code.CANCELLED
-        for call in calls:
+        assert alone.is_active()
+        for call in (alone, *calls):
             call.cancel()
         silence.over.set()
 

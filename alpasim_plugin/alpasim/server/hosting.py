@@ -11,7 +11,7 @@ import ipaddress
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -386,19 +386,24 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def cancel_slow(self) -> None:
         """Cancel the calls that have not sent their message, or taken their answer, in time."""
-        self._cancel_senders(SENDING_S)
-        self._unread.cancel_slow()
-
-    def _cancel_senders(self, limit_s: float) -> None:
-        """Cancel the calls that have been sending their message for longer than a time."""
-        latest_s = time.monotonic() - limit_s
+        latest_s = time.monotonic() - SENDING_S
         for context, since_s in list(self._senders.items()):
             if since_s < latest_s:
                 context.cancel()
+        self._unread.cancel_slow()
 
     def _make_room(self) -> None:
-        """Cancel slow senders earlier, because a call waits for a place of theirs."""
-        self._cancel_senders(CROWDED_S)
+        """Cancel a slow sender earlier, because a call waits for its place: on the connection that
+        has the most places, the call that came first.
+        """
+        senders = list(self._senders.items())
+        places = Counter(context.peer() for context, _ in senders)
+        latest_s = time.monotonic() - CROWDED_S
+        slow = [(context, since_s) for context, since_s in senders if since_s < latest_s]
+        if slow:
+            context, _ = min(slow, key=lambda sender: (-places[sender[0].peer()], sender[1]))
+            self._senders.pop(context, None)
+            context.cancel()
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -431,7 +436,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
             for message in messages:
                 return message
         finally:
-            del self._senders[context]
+            self._senders.pop(context, None)
         raise Late("the message did not come")
 
 
