@@ -221,6 +221,142 @@ def medians(policies: int) -> Iterator[Sequence[str]]:
         yield (str(seeds), f"{100 * np.mean(held):.1f}" if held else "none is given")
 
 
+@dataclass(frozen=True)
+class SeedWorld:
+    """Where the seeds of a policy fail along one parameter.
+
+    Attributes:
+        name: In words.
+        draw: Random numbers -> the windows in which a seed fails, between 0 and 1.
+        median: Of the lowest value above which a seed's outcome first changes, over seeds; None where
+            half of them never change.
+    """
+
+    name: str
+    draw: Callable[[np.random.Generator], list[tuple[float, float]]]
+    median: float | None
+
+
+def normal(centre: float) -> Callable[[np.random.Generator], list[tuple[float, float]]]:
+    """Return a world that fails below a boundary that varies by 5 %."""
+    return lambda rng: [(-1.0, float(centre + 0.05 * rng.standard_normal()))]
+
+
+def fifth(
+    usual: Callable[[np.random.Generator], list[tuple[float, float]]],
+    other: Callable[[np.random.Generator], list[tuple[float, float]]],
+    share: float = 0.2,
+) -> Callable[[np.random.Generator], list[tuple[float, float]]]:
+    """Return a world in which a share of seeds is another."""
+    return lambda rng: other(rng) if rng.random() < share else usual(rng)
+
+
+def window(rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Draw a window of 15 % and nothing else."""
+    start = float(rng.uniform(0.4, 0.8))
+    return [(start, start + 0.15)]
+
+
+def with_window(rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Draw a boundary at 0.3 and a window above it."""
+    return [*normal(0.3)(rng), *window(rng)]
+
+
+def above(rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Draw a boundary above which a seed fails."""
+    return [(float(0.7 + 0.05 * rng.standard_normal()), 2.0)]
+
+
+def never(rng: np.random.Generator) -> list[tuple[float, float]]:
+    """Fail nowhere."""
+    return []
+
+
+SEED_WORLDS = (
+    SeedWorld("a boundary that varies by 5 %", normal(0.3), 0.3),
+    SeedWorld("the same, one seed in five elsewhere", fifth(normal(0.3), normal(0.8)), 0.315930),
+    SeedWorld("the same, one in five with a window too", fifth(normal(0.3), with_window), 0.3),
+    SeedWorld("one in five fails in a window only", fifth(never, window), None),
+    SeedWorld("one in fifty does", fifth(never, window, 0.02), None),
+    SeedWorld("half fail below, half above", fifth(normal(0.3), above, 0.5), 0.5),
+)
+
+
+def searched_together(policies: Sequence[Fails], spacings: int) -> list[dict[int, bool]]:
+    """Drive several seeds until the search of each has ended, all at the points that any asks for."""
+    steps = spacings * PARTS
+    failed: list[dict[int, bool]] = [{} for _ in policies]
+    while True:
+        points = {
+            point
+            for seed in failed
+            for point in next_points(seed, range(0, steps + 1, PARTS), frozenset())
+        }
+        if not points:
+            return failed
+        for seed, fails in zip(failed, policies, strict=True):
+            seed |= {point: fails(point / steps) for point in points}
+
+
+def is_false_over_seeds(outcomes: dict[str, list[list[float]]]) -> bool:
+    """Tell whether the stretches of several seeds contradict a driven point, or leave one out."""
+    counts: dict[float, int] = {}
+    for points in outcomes.values():
+        for value, has_failed in points:
+            counts[value] = counts.get(value, 0) + int(has_failed)
+    stated = 0
+    for stretch in stretches_of(outcomes):
+        inside = [count for value, count in counts.items() if stretch.low <= value <= stretch.high]
+        stated += len(inside)
+        if (min(inside), max(inside), len(inside)) != (stretch.least, stretch.most, stretch.points):
+            return True
+        if stretch.most and not stretch.least:  # "fails in 0 to 2 of 5 seeds"
+            return True
+    return stated != len(counts)
+
+
+def over_seeds(policies: int, sizes: Sequence[int] = (3, 6, 20)) -> Iterator[Sequence[str]]:
+    """Give a row for each world of seeds: false sentences, false verdicts of a gate with a margin of 0
+    against a baseline whose seeds are drawn anew, intervals of the median that are given, and those
+    that are false; for numbers of seeds.
+    """
+    for world in SEED_WORLDS:
+        row = [world.name]
+        for seeds in sizes:
+            flags = np.zeros(4)
+            for number in range(policies):
+                rng = stream("boundary", number, f"seeds/{world.name}/{seeds}")
+                sides = []
+                for _ in range(2):
+                    drawn = [world.draw(rng) for _ in range(seeds)]
+                    sides.append([policy_of(windows, 0.0, rng) for windows in drawn])
+                # both variants are driven at the points that either asks for
+                driven = searched_together([*sides[0], *sides[1]], 16)
+                now, was = (
+                    {str(i): outcomes_of(seed, 16)["0"] for i, seed in enumerate(part)}
+                    for part in (driven[:seeds], driven[seeds:])
+                )
+                difference = difference_of(now, was, [[0.0, 1.0]])
+                assert difference is not None, "both have driven the same points"
+                is_new = any(
+                    seed[point] and not base[point]
+                    for seed, base in zip(driven[:seeds], driven[seeds:], strict=True)
+                    for point in seed
+                )
+                interval = median_boundary(now)
+                is_missed = interval is not None and not (
+                    world.median is not None and interval.low <= world.median <= interval.high
+                )
+                flags += [
+                    is_false_over_seeds(now),
+                    (difference.anew > 0.0) != is_new,
+                    interval is not None,
+                    is_missed,
+                ]
+            row.append(" / ".join(f"{100 * flag / policies:.0f}" for flag in flags))
+        yield row
+
+
 # of 0.8 N(0.3, 0.05) + 0.2 N(0.8, 0.05): 0.8 Phi(z) = 0.5 at z = 0.3186
 MEDIAN = 0.3 + 0.05 * 0.3186
 
@@ -234,6 +370,11 @@ def main() -> None:
     table(("world", "5 first points", "9", "17"), along_one_key(policies))
     say("Two keys: drives of a seed / discs unseen, %\n")
     table(("world", "5 x 5 first points", "7 x 7", "9 x 9"), discs(policies))
+    say(
+        "Several seeds, 17 first points: false sentences / false verdicts / intervals of a median "
+        "boundary that are given / false ones, %\n"
+    )
+    table(("world", "3 seeds", "6", "20"), over_seeds(policies))
     say("Coverage of the median boundary over seeds, %\n")
     table(("seeds", "coverage"), medians(policies))
 

@@ -58,14 +58,16 @@ class Difference:
         pairs: Their number.
         gained: Pairs of which the variant alone fails.
         lost: Pairs of which the baseline alone fails.
-        more: By how much more of the range the variant fails, each point standing for what is
+        anew: Over how much of the range the variant alone fails, each point standing for what is
             nearest to it; along two parameters as a share of the points of the grid. The mean over
             seeds.
+        more: The same, less that over which the baseline alone fails.
     """
 
     pairs: int
     gained: int
     lost: int
+    anew: float
     more: float
 
 
@@ -163,7 +165,7 @@ def difference_of(
             grid alone are counted, so that none stands for more than others.
     """
     gained, lost, pairs = 0, 0, 0
-    more = []
+    by_seed = []
     for seed in sorted(set(now) & set(was)):
         sides = [
             {tuple(values): bool(has_failed) for *values, has_failed in side[seed]}
@@ -178,11 +180,16 @@ def difference_of(
         pairs += len(shared)
         gained += int(np.sum(change > 0))
         lost += int(np.sum(change < 0))
-        if len(first) == 2:
-            more.append(float(np.mean(change)))
-        else:
-            more.append(float(change @ nearest_lengths([value for (value,) in shared])))
-    return Difference(pairs, gained, lost, float(np.mean(more))) if more else None
+        lengths = (
+            np.full(len(shared), 1.0 / len(shared))
+            if len(first) == 2
+            else nearest_lengths([value for (value,) in shared])
+        )
+        by_seed.append([lengths @ np.maximum(change, 0), lengths @ change])
+    if not by_seed:
+        return None
+    anew, more = np.mean(by_seed, axis=0).tolist()
+    return Difference(pairs, gained, lost, anew, more)
 
 
 def nearest_lengths(values: Sequence[float]) -> F64:

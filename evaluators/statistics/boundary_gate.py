@@ -1,5 +1,5 @@
-"""A gate on boundaries: how much more of a parameter's range may fail than with the baseline, counted
-at the points that both have driven.
+"""A gate on boundaries: over how much of a parameter's range a variant may fail where the baseline does
+not, counted at the points that both have driven. What no longer fails makes up for nothing.
 """
 
 import numpy as np
@@ -117,7 +117,7 @@ def _checked(
     if difference is None:
         return "incomplete", "no point was driven with both, for no seed is that of both", None
     assert spec.boundary_margin is not None, "only a gate on boundaries comes here"
-    cause: Cause = "regression" if difference.more > spec.boundary_margin + ROUNDING else "pass"
+    cause: Cause = "regression" if difference.anew > spec.boundary_margin + ROUNDING else "pass"
     unit = " of the points" if is_area else f" {record['unit']}".rstrip()
     return (
         cause,

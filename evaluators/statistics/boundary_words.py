@@ -20,9 +20,12 @@ def difference_text(difference: JsonView, unit: str) -> str:
     """Say over how much more or less of a range a variant fails than its baseline, and at how many
     points.
     """
-    more = difference["more"]
+    more, anew = difference["more"], difference["anew"]
+    parts = ""
+    if difference["gained"] and difference["lost"]:
+        parts = f" ({fixed(anew, 2)} anew, {fixed(anew - more, 2)} no longer)"
     return (
-        f"fails over {fixed(abs(more), 2)}{unit} {'less' if more < 0 else 'more'}: of "
+        f"fails over {fixed(abs(more), 2)}{unit} {'less' if more < 0 else 'more'}{parts}: of "
         f"{plural(difference['pairs'], 'paired drive')} {difference['gained']} fail anew and "
         f"{difference['lost']} no longer"
     )

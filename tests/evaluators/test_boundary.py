@@ -22,6 +22,7 @@ from evaluators.statistics.boundary import (
 )
 from evaluators.statistics.boundary_area import AREA_PARTS, AREA_SPACINGS, claims_of
 from evaluators.statistics.intervals import least_for_median
+from tests.boundary_worlds import SEED_WORLDS, over_seeds
 
 STEPS = SPACINGS * PARTS
 FIRST = range(0, STEPS + 1, PARTS)
@@ -115,6 +116,7 @@ def test_a_window_beside_an_equal_boundary_is_a_difference():
     assert difference.more == pytest.approx(8, abs=1)
     back = difference_of(outcomes(without), outcomes(with_window), [list(FIRST)])
     assert back.more == -difference.more
+    assert (back.anew, difference.anew) == (0.0, difference.more)
 
 
 def test_a_difference_is_paired_by_point_and_seed():
@@ -122,7 +124,7 @@ def test_a_difference_is_paired_by_point_and_seed():
     was = {"0": [[0.0, True], [1.0, False], [3.0, True], [4.0, False]], "2": [[0.0, False]]}
     difference = difference_of(now, was, [[0.0, 4.0]])
     # points 0, 1, 4 stand for 0.5, 2 and 1.5 of the range
-    assert vars(difference) == {"pairs": 3, "gained": 1, "lost": 0, "more": 2.0}
+    assert vars(difference) == {"pairs": 3, "gained": 1, "lost": 0, "anew": 2.0, "more": 2.0}
     assert difference_of({"1": now["1"]}, {"2": was["2"]}, [[0.0, 4.0]]) is None
 
 
@@ -191,3 +193,14 @@ def test_a_sentence_says_where_it_fails_and_how_fine_was_driven():
     assert "6 seeds can give an interval" in sentence
     sentence = sentence_of(record([fails, holds] * 4))
     assert "fails at 32 of 76 points, and changes 7 times" in sentence
+
+
+def test_over_seeds_no_sentence_and_no_verdict_contradicts_what_was_driven():
+    rows = list(over_seeds(policies=2, sizes=(3, 6)))
+    assert [row[0] for row in rows] == [world.name for world in SEED_WORLDS]
+    for _, *cells in rows:
+        for cell in cells:
+            false, false_verdicts, _, _ = cell.split(" / ")
+            assert (false, false_verdicts) == ("0", "0")
+    given = {row[0]: [cell.split(" / ")[2] for cell in row[1:]] for row in rows}
+    assert given["a boundary that varies by 5 %"] == ["0", "100"]

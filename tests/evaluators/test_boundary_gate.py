@@ -53,14 +53,24 @@ def record(base, variant, **more):
         (fails((4, 7), (8.5, 9.5)), fails((4, 7)), 0),
         (fails(), fails((4, 6)), 1),
         (fails(), fails((0, 20)), 1),
+        (fails((4, 7)), fails((10, 13)), 1),  # as much, elsewhere
+        (fails((4, 7)), fails((6, 9)), 1),
     ],
 )
-def test_a_variant_may_fail_over_more_of_the_range_by_the_margin(base, variant, code):
+def test_a_variant_may_fail_anew_over_as_much_of_the_range_as_the_margin(base, variant, code):
     verdict = boundary_verdict(TABLE, GATE, record(base, variant))
     assert verdict.exit_code == code
     (check,) = verdict.checks
     assert check.renderer == "3dgs"
     assert "points 0.5 m apart, a narrower change is not seen" in check.text
+
+
+def test_what_fails_elsewhere_is_said_for_both_sides():
+    (check,) = boundary_verdict(TABLE, GATE, record(fails((4, 7)), fails((10, 12)))).checks
+    assert (
+        "fails over 0.75 m less (2.00 anew, 2.75 no longer): of 21\xa0paired drives 4" in check.text
+    )
+    assert check.cause == "regression"
 
 
 def test_of_a_rectangle_points_of_the_grid_are_counted():
