@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.seeding import stream
+from evaluators.statistics.decision import Question, metric_question, state_after
 from evaluators.statistics.intervals import TAIL, exact_rate, paired_rate, rate_at_most
 from evaluators.statistics.noise import (
     beyond,
@@ -22,6 +23,8 @@ from tests.calibration import (
     DISTANCES,
     QUICK,
     Effort,
+    TwoValues,
+    decided,
     differences_of_rates,
     gates_of_distances,
     outcomes,
@@ -115,12 +118,34 @@ def test_the_seeds_that_decide_are_those_at_which_the_tests_reject():
 
 
 def test_the_calibration_prints_a_row_for_each_law_and_size():
-    rows = list(gates_of_distances(Effort(draws=3, flips=1, most_cells=6)))
+    rows = list(gates_of_distances(Effort(draws=3, most_cells=6)))
     assert {row[0] for row in rows} == {law.name for law in DISTANCES}
     assert QUICK.draws < 100
 
 
+def test_many_decisions_at_once_are_those_of_one_after_another():
+    question = Question((metric_question("lateral_distance_m", 0.1),))
+    law = TwoValues(0.3, 1.0, -0.1)
+    rows = [law(stream("noise", number, "decided"), 60) for number in range(3)]
+    rows += [np.zeros(60), np.full(60, 1.0), np.full(60, 5.0)]
+    expected = [
+        state_after(question, {"lateral_distance_m": harms}, 60).metrics["lateral_distance_m"]
+        for harms in rows
+    ]
+    assert decided(np.array(rows), 0.1, 4.0) == [look["verdict"] for look in expected]
+    assert expected[-1]["verdict"] == "worse"
+
+
+def test_the_outcomes_of_two_values_have_all_chances():
+    law = TwoValues(0.1, 2.0, -1.0)
+    chances = [chance for _, chance in law.outcomes(7)]
+    assert sum(chances) == pytest.approx(1.0)
+    mean = sum(chance * values.mean() for values, chance in law.outcomes(7))
+    assert mean == pytest.approx(law.mean)
+    assert law.cut(-0.5, 1.0).mean == pytest.approx(0.1 * 1.0 - 0.9 * 0.5)
+
+
 def test_a_difference_of_rates_is_covered_where_many_scenes_change_either_way():
-    for row in differences_of_rates(Effort(draws=0, flips=0, most_cells=40)):
+    for row in differences_of_rates(Effort(draws=0, most_cells=40)):
         for cell in row[1:]:
             assert float(cell.split(" / ")[1]) >= 95.0
