@@ -699,7 +699,10 @@ def _suite_entry(
     else:
         counts = {"worse": int(np.sum(change.beyond(change.margin)))}
         counts["better"] = int(np.sum(change.harms[0] < -change.margin - ROUNDING))
-    counts["equal"] = n_cells - int(np.sum(change.harms[0] != 0.0))
+    n_equal = n_cells - int(np.sum(change.harms[0] != 0.0))
+    if not metric.is_flag:
+        counts["within the margin"] = n_cells - n_equal - counts["worse"] - counts["better"]
+    counts["equal"] = n_equal
     diff = 0.0 - change.mean if metric.direction == "higher" else change.mean
     return {
         "baseline": pair.label,

@@ -189,7 +189,8 @@ def change_text(entry: JsonView, metric: MetricInfo) -> str:
     elif not metric.is_flag:
         mean = entry["diff"] * scale
         margin = entry["margin"] * scale
-        parts.insert(0, f"mean {mean:+.3g}, margin {margin:.3g} {unit}".rstrip())
+        change = f"mean {mean:+.3g} {unit}".rstrip()
+        parts.insert(0, f"{change}, margin {margin:.3g} {unit}".rstrip())
     if entry["worst"] and entry["verdict"] != "non-inferior":
         parts.append(f"worst in {some_of([_place(pair) for pair in entry['worst']], NAMED)}")
     if entry["cut_mean"] is not None:

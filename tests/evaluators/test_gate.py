@@ -179,12 +179,28 @@ def test_a_verdict_counts_and_names_what_changed():
     distance = checks["lateral_distance_m"]
     assert event.entry["counts"] == {"equal": 10, "new": 1, "gone": 3}
     assert event.entry["worst"] == [{"scene": "s004", "seed": 0, "was": 0.0, "now": 1.0}]
-    assert distance.entry["counts"] == {"equal": 13, "worse": 1, "better": 0}
+    assert distance.entry["counts"] == {
+        "equal": 13,
+        "worse": 1,
+        "better": 0,
+        "within the margin": 0,
+    }
     assert [pair["scene"] for pair in distance.entry["worst"]] == ["s004"]
     for check in (event, distance):
         assert check.cause == "regression"
         assert "s004" in check.text
     assert "1 new, 3 gone" in event.text
+
+
+def test_the_counts_of_a_line_add_up_to_its_pairs():
+    now = both(add(0.05, where=slice(0, 5)), add(-0.4, where=slice(5, 7)), add(0.2, where=ONE))
+    verdict = judged([*rows("clean"), *now(rows())], gate())
+    for check in verdict.checks:
+        if "counts" in check.entry:
+            assert sum(check.entry["counts"].values()) == check.entry["n_cells"] == SCENES
+    (line,) = (c.text for c in verdict.checks if c.metric == "lateral_distance_m")
+    line = line.replace("\u00a0", " ")
+    assert "m, margin 0.1 m; 1 worse, 2 better, 4 within the margin, 7 equal of 14 pairs" in line
 
 
 LIMITS = GateSpec(version=1, metrics={"offroad": MetricRule(max=0.0)})
