@@ -311,10 +311,11 @@ def measure_quality(
         out: Folder of results.
         report: Called after each clip with its number, the number of all, the work and its row.
     """
-    rows = []
+    finished = {}
     for i, (work, row) in enumerate(map_jobs(finish, works, jobs), start=1):
         report(i, len(works), work, row)
-        rows.append(row)
+        finished[work.row_file] = row
+    rows = [finished[work.row_file] for work in works]  # with several jobs they end in any order
     variants = {
         work.variant.label: work.variant.spec for work in works if work.variant.label != TRUTH
     }

@@ -16,7 +16,8 @@ from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.fixers.bundle import save_bundle
-from alpasim_plugin.lab.bench.quality import Work, finish, shown_frames
+from alpasim_plugin.lab.bench import quality
+from alpasim_plugin.lab.bench.quality import Work, finish, measure_quality, shown_frames
 from alpasim_plugin.lab.cli.bench_quality import parse_variants
 from alpasim_plugin.lab.training.bundle_fixer import bundle_fixer
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
@@ -94,6 +95,32 @@ def test_a_table_a_document_charts_and_pictures(data, bundle, tmp_path, capsys):
 
     table = (out / "quality.md").read_text()
     assert table.count("| identity |") == 2
+
+
+def test_clips_that_end_in_another_order_keep_their_rows_and_pictures(tmp_path, monkeypatch):
+    root = tmp_path / "pairs"
+    for name, frames in (("long", FRAMES), ("short", 9)):
+        make(root, "test-known", name, frames=frames)
+    works = [
+        Work(root / "test-known" / name, "render", variant, FRAMES, 0, "cpu", 1, None,
+             tmp_path / "out", True)
+        for variant in parse_variants("3dgs,identity", [])
+        for name in ("long", "short")
+    ]  # fmt: skip
+
+    def last_first(work, jobs, workers):
+        yield from ((job, work(job)) for job in reversed(jobs))
+
+    monkeypatch.setattr(quality, "map_jobs", last_first)
+    told = []
+    summary = measure_quality(
+        works, "3dgs", 2, tmp_path / "out", lambda i, n, work, row: told.append(row["clip"])
+    )
+    assert told == ["short", "long"] * 2
+    assert list(summary["arms"]) == ["3dgs", "identity"], "in the order of the command"
+    assert summary["frames"]["identity"] == [9, FRAMES]
+    sheets = {path.stem for path in (tmp_path / "out" / "sheets").iterdir()}
+    assert sheets == {"long", "short"}
 
 
 def test_finished_clips_are_kept_until_something_differs(data, tmp_path):
