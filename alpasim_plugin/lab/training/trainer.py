@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -313,6 +313,7 @@ class Trainer(Generic[Batch]):
         indices = range(first, (self.step + 1) * n, self._stride)
         parts = len(indices) * self.ranks  # whose mean is the update's
         held = []  # until the host has waited for the device
+        losses = []
         for index in indices:
             held.append(self._ahead.pop(index) if index in self._ahead else self._sent(index))
             with autocast(self.device, self._autocast):
@@ -321,6 +322,7 @@ class Trainer(Generic[Batch]):
             following = index + self._stride
             if following < self._end:
                 self._ahead[following] = self._sent(following)
+            losses.append(loss.detach())
             for name, value in {"loss": loss.detach(), **numbers}.items():
                 sums[name] = sums.get(name, 0.0) + value / parts
         totals = stacked(sums, self.device)
@@ -332,7 +334,7 @@ class Trainer(Generic[Batch]):
         values = torch.stack([*totals, *norms.values()]).cpu()  # the host waits here alone
         logged = dict(zip([*sums, *norms], values.tolist(), strict=True))
         if not all(map(math.isfinite, logged.values())):
-            self._stop(index, f"update {self.step}: {logged}")
+            self._stop(held, losses, f"update {self.step}: {logged}")
         lr = self.schedule.lr(self.step)
         for group in self.optimiser.param_groups:
             group["lr"] = lr * group["rate"]
@@ -374,14 +376,19 @@ class Trainer(Generic[Batch]):
                 if p.grad is not None:
                     self.average[name].lerp_(p, 1 - decay)
 
-    def _stop(self, index: int, problem: str) -> None:
+    def _stop(self, batches: Sequence[Batch], losses: Sequence[Tensor], problem: str) -> None:
+        """Save the batch whose loss is not finite, the last one where all losses are, and raise."""
+        is_bad = [not math.isfinite(float(loss)) for loss in losses]
+        batch = batches[is_bad.index(True)] if any(is_bad) else batches[-1]
         path = self.folder / BAD_FILE
         with atomic_file(path) as partial:
-            torch.save(self._batch(index), partial)
+            torch.save(moved(batch, torch.device("cpu")), partial)
         self.save()
         raise InfrastructureError(
             f"{self.folder}: {problem}",
-            f"inspect the batch in {path}; lower the learning rate or repair the data, then run again: training resumes",
+            f"inspect the batch in {path}. This folder goes on with its own settings alone: after "
+            "repairing what makes the batch, give the same command; with a lower learning rate, "
+            "begin in another folder",
         )
 
     def _write_log(self, numbers: Mapping[str, float]) -> None:

@@ -36,6 +36,17 @@ def test_nan_stops_with_the_batch_saved_and_good_weights_kept(tmp_path):
     assert again.step == 9
 
 
+def test_of_several_batches_the_one_whose_loss_is_not_finite_is_saved(tmp_path):
+    t = trainer(tmp_path, Schedule(steps=9, accumulate=3), bad_at=13)  # the second of update 4
+    with pytest.raises(InfrastructureError) as caught:
+        t.run()
+    assert torch.equal(torch.load(tmp_path / BAD_FILE, weights_only=True), batch(13))
+    assert "lower learning rate, begin in another folder" in caught.value.hint
+    with pytest.raises(InputError):  # as the advice says
+        trainer(tmp_path, Schedule(steps=9, accumulate=3, peak_lr=1e-5))
+    assert trainer(tmp_path, Schedule(steps=9, accumulate=3)).step == 4
+
+
 def test_folder_of_another_run_is_refused(tmp_path):
     trainer(tmp_path, Schedule(steps=2)).run()
     with pytest.raises(InputError):
