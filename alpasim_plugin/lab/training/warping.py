@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.core.devices import download, upload
 from alpasim_plugin.core.types import F32
 
 EPS = 1e-6
@@ -30,12 +31,11 @@ def flow_between(earlier: Tensor, present: Tensor) -> Tensor:
 
     Returns:
         ``(B, K, H, W, 2)``: displacement (x, y), pixels, from a pixel of the earlier frame to its
-        place in the present one.
+        place in the present one; on the device of the frames.
     """
     clips = zip(_grey(earlier), _grey(present[:, :, None]), strict=True)
-    return torch.from_numpy(
-        np.stack([[_farneback(frame, now) for frame in before] for before, (now,) in clips])
-    )
+    flow = np.stack([[_farneback(frame, now) for frame in before] for before, (now,) in clips])
+    return upload(flow, earlier.device)
 
 
 def warping_loss(predicted: Tensor, earlier: Tensor, flow: Tensor) -> Tensor:
@@ -47,9 +47,9 @@ def warping_loss(predicted: Tensor, earlier: Tensor, flow: Tensor) -> Tensor:
         flow: From `flow_between`.
     """
     h, w = predicted.shape[-2:]
-    rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-    place = flow + torch.stack([columns, rows], dim=-1)
-    size = torch.tensor([w - 1, h - 1])
+    columns, rows = np.meshgrid(np.arange(w), np.arange(h))
+    place = flow + upload(np.stack([columns, rows], axis=-1), flow.device)
+    size = upload(np.array([w - 1, h - 1]), flow.device)
     valid = ((place >= 0) & (place <= size)).all(dim=-1)
     errors = []
     for k in range(earlier.shape[2]):
@@ -67,18 +67,9 @@ def warping_loss(predicted: Tensor, earlier: Tensor, flow: Tensor) -> Tensor:
 
 def _grey(frames: Tensor) -> list[list[np.ndarray]]:
     """Convert ``(B, 3, K, H, W)`` to B x K grey images, uint8."""
-    levels = (
-        frames.detach()
-        .add(1)
-        .mul(127.5)
-        .round()
-        .clamp(0, 255)
-        .to(torch.uint8)
-        .permute(0, 2, 3, 4, 1)
-        .contiguous()
-        .numpy()
-    )
-    return [[cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip] for clip in levels]
+    levels = frames.detach().add(1).mul(127.5).round().clamp(0, 255).to(torch.uint8)
+    (clips,) = download(levels.permute(0, 2, 3, 4, 1))
+    return [[cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in clip] for clip in clips]
 
 
 def _farneback(earlier: np.ndarray, present: np.ndarray) -> F32:
