@@ -33,6 +33,7 @@ from policies.learned_views import in_planes, network_input
 
 Report = Callable[[int, Mapping[str, float]], None]
 SIGMA_KNOT = KNOTS_M.index(16.0)
+WIDEST = 6.0  # deviations up to which an error counts as a normal one
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,7 @@ class PolicyTask:
         off = torch.stack(
             [lateral[:, SIGMA_KNOT], speed_error.mean(1) / mean_speed.clamp_min(3.0)], dim=1
         ).detach()
-        sigma = (
-            torch.log(prediction.sigma) + 0.5 * (off / prediction.sigma).clamp(-6.0, 6.0) ** 2
-        ).mean()
+        sigma = sigma_loss(off, prediction.sigma).mean()
         proximity, leader_speed = prediction.leader.T
         wanted_proximity, wanted_leader_speed = batch.leader.T
         # Auxiliary task: the plan does not depend on the predicted leader.
@@ -338,12 +337,25 @@ def train(
 
 
 def _jitter_brightness(view: U8, contrast: float, brightness: float) -> U8:
-    return np.asarray(
-        cv2.convertScaleAbs(
-            view, alpha=contrast * brightness, beta=128.0 * brightness * (1.0 - contrast)
-        ),
-        dtype=np.uint8,
-    )
+    """Change contrast about the middle level, then brightness; levels end at 0 and 255."""
+    levels = np.arange(256.0)
+    changed = brightness * (contrast * levels + 128.0 * (1.0 - contrast))
+    table = np.clip(np.rint(changed), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(view, table), dtype=np.uint8)
+
+
+def sigma_loss(off: Tensor, sigma: Tensor) -> Tensor:
+    """Return the negative log-likelihood of errors under normal deviations; beyond `WIDEST` of them
+    it goes on as a straight line, so that few large errors do not outweigh all others and still widen
+    sigma.
+
+    Args:
+        off: ``(...)`` errors.
+        sigma: ``(...)`` standard deviations, above 0.
+    """
+    deviations = (off / sigma).abs()
+    inside = deviations.clamp_max(WIDEST)
+    return torch.log(sigma) + inside * (deviations - 0.5 * inside)
 
 
 def measure(task: PolicyTask, stride: int = 1, batch: int = 64) -> dict[str, float]:
