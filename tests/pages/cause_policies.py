@@ -297,7 +297,7 @@ class WrongCrop(Looker):
     def seen(self, observation):
         def crop(rgb):
             height, width = rgb.shape[:2]
-            left = np.ascontiguousarray(rgb[:, : width * 4 // 5])
+            left = np.ascontiguousarray(rgb[:, : width * 7 // 10])
             return cv2.resize(left, (width, height), interpolation=cv2.INTER_LINEAR)
 
         route = np.full_like(observation.route_rig, np.nan)
