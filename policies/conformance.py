@@ -61,6 +61,7 @@ MIN_HORIZON_S = 2.0
 MAX_STEP_S = 0.5
 LATENCY_MS = 100.0  # of a policy query, in the median
 FIRST_POSE_M = 0.5
+NEAR_M = 20.0  # a first pose that lies farther away looks like coordinates of the world
 START_US = 1_700_000_000_000_000  # epoch time, so that a policy that counts in float32 fails
 STEP_US = 100_000
 # Away from the origin: world coordinates differ from rig coordinates.
@@ -98,7 +99,10 @@ def frame_fault(plan: Plan) -> str:
     """
     away_m = float(np.hypot(*plan.xy[0]))
     if away_m > FIRST_POSE_M:
-        return f"the first pose lies {away_m:.1f} m from the rig's origin: plans are in the rig frame, not the world's"
+        frame = "plans begin at the ego, in the middle of its rear axle"
+        if away_m > NEAR_M:
+            frame = "plans are in the rig frame, not the world's"
+        return f"the first pose lies {away_m:.1f} m from the rig's origin: {frame}"
     widest = float(np.abs(plan.yaw).max())
     if widest > 2 * np.pi:
         return f"yaw reaches {widest:.1f}: it looks like degrees, needed are radians"

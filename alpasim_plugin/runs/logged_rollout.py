@@ -127,17 +127,33 @@ def _with_own_settings(options: RunOptions, renderer: str) -> RunOptions:
 
 
 def named_rollout(rollouts: Sequence[Rollout], name: str) -> Rollout:
-    """Return a rollout of a run by its name or its folder.
+    """Return a rollout of a run by its name or its folder; of several logs of one cell by its
+    folder, or by the cell's name and the log's.
 
     Raises:
-        InputError: The run has no such rollout.
+        InputError: The run has no such rollout, or several logs of that name.
     """
-    by_name = {cell_name(*row.cell): row for row in rollouts}
-    wanted = name.strip("/")
-    by_folder = {row.path.removeprefix("rollouts/"): row for row in rollouts}
-    rollout = by_name.get(wanted) or by_folder.get(wanted.removeprefix("rollouts/"))
-    if rollout is None:
-        near = difflib.get_close_matches(wanted, by_name, 3, 0.0)
+    wanted = name.strip("/").removeprefix("rollouts/")
+    matches = [row for row in rollouts if wanted in _names_of(row)]
+    if len(matches) > 1:
+        logs = [row.path.removeprefix("rollouts/") for row in matches]
+        raise InputError(
+            f"{name}: the run has {len(matches)} logs of it",
+            f"Name one: {', '.join(logs[:MOST_LOGS])}{', ...' if len(logs) > MOST_LOGS else ''}",
+        )
+    if not matches:
+        names = dict.fromkeys(cell_name(*row.cell) for row in rollouts)
+        near = difflib.get_close_matches(wanted, names, 3, 0.0)
         do_this = f"Did you mean {' or '.join(near)}?" if near else "Name a run that has rollouts."
         raise InputError(f"{name}: the run has no such rollout among its {len(rollouts)}", do_this)
-    return rollout
+    return matches[0]
+
+
+MOST_LOGS = 4  # that an error names
+
+
+def _names_of(row: Rollout) -> set[str]:
+    """Return what a rollout can be called: its cell, its folder, and its cell and log."""
+    cell = cell_name(*row.cell)
+    names = {cell, row.path.removeprefix("rollouts/")}
+    return names | {f"{cell}/{row.log}"} if row.log else names

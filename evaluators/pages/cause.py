@@ -23,7 +23,7 @@ from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
 from alpasim_plugin.log.images import smaller
 from alpasim_plugin.log.run_folder.reader import last_output, read_json
-from alpasim_plugin.log.run_folder.records import PolicyCheck
+from alpasim_plugin.log.run_folder.records import DriveEvent, PolicyCheck
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
@@ -39,7 +39,6 @@ from evaluators.metrics.outcomes import (
     SHORT_OF_END,
     ending_of,
     first_failure,
-    gravity,
     in_words,
     outcomes_of,
 )
@@ -48,19 +47,28 @@ from evaluators.pages.drive_data import (
     Place,
     map_data,
     plan_lines,
+    rounded,
     scene_of,
     user_data,
 )
-from evaluators.pages.evidence import contact_of_failure, plan_facts
 from evaluators.pages.images import frame_rows, jpeg, seen_before
 from evaluators.pages.page import as_json, fill
 from evaluators.pages.rollouts import clock_zero_us
+from evaluators.statistics.alike import common_to_failures
+from evaluators.statistics.approach import gap_series
+from evaluators.statistics.evidence import (
+    Failure,
+    contact_of_failure,
+    failure_facts,
+    kind_of,
+)
 from evaluators.statistics.opening import Run
+from evaluators.statistics.outcomes import worst_of
 
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
 MOST_QUERIES = 48
-SCRIPTS = ("theme.js", "timeline.js", "overlay.js", "cause.js")
+SCRIPTS = ("theme.js", "timeline.js", "birdseye.js", "overlay.js", "curves.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
 CHECK = "Check of the policy before the run: "
 # Notes of a check, and the outcomes beside which they are shown.
@@ -105,6 +113,7 @@ class Cause:
         sentences: What the run shows, the most telling first.
         partings: When plans part from others'.
         log: As far as it was written; None where there is none.
+        failure: The seconds before it failed, measured; None where nothing could be measured.
     """
 
     rollout: Rollout
@@ -114,6 +123,7 @@ class Cause:
     sentences: Sequence[str]
     partings: Sequence[Parting]
     log: RolloutLog | None
+    failure: Failure | None = None
 
     @property
     def failed_s(self) -> float | None:
@@ -121,19 +131,23 @@ class Cause:
         return None if self.failed_us is None else (self.failed_us - self.start_us) * 1e-6
 
 
-def worst_failure(run: Run) -> Rollout:
-    """Return the rollout of a run that failed worst: one that broke off, then the gravest outcome.
+def worst_failure(run: Run, rollouts: Sequence[Rollout] | None = None) -> Rollout:
+    """Return the rollout of a run that failed worst; see `worst_of`.
+
+    Args:
+        run: The run.
+        rollouts: Those of it that are compared; all by default.
 
     Raises:
         InputError: No rollout failed.
     """
-    failed = [rollout for rollout in run.rollouts if not rollout.ok or outcomes_of(rollout)]
-    if not failed:
+    worst = worst_of(run.rollouts if rollouts is None else rollouts)
+    if worst is None:
         raise InputError(
             f"{run.folder}: no rollout of this run failed",
             "Name a rollout: simrun why RUN/RENDERER/POLICY/SCENE/SEED.",
         )
-    return min(failed, key=lambda rollout: gravity(rollout) if rollout.ok else -1)
+    return worst
 
 
 def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
@@ -167,17 +181,11 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
         outcome = f"{rollout.failure_class}: {rollout.failure}"
         last_lines = last_output(run.folder / rollout.path / OUTPUT_NAME)
         sentences = [*(sentences or [rollout.failure]), *last_lines]
-    sentences += behind_others(run, rollout)
-    for name, text in sorted(check.notes, key=lambda note: note[0] != "lag"):
-        if outcomes & {*TELLING.get(name, ())}:
-            sentences.append(f"{CHECK}{text}.")
+    failure = None
     if log is not None and rollout.ok:
-        ended_us = int(log.ego.t_us[-1]) if outcome == SHORT_OF_END else failed_us
-        contact = None
-        if manifest is not None and first is not None:
-            contact = contact_of_failure(log, first, manifest.contacts)
-        if ended_us is not None:
-            sentences += plan_facts(log, ended_us, outcomes, contact)
+        failure = _measured(run, rollout, log, first, failed_us)
+    sentences += _evidence(run, rollout, failure)
+    sentences += _telling_notes(check, outcomes)
     sentences += [
         f"Plans part from those of the {parting.kind} {parting.name} at {parting.at_s:.1f} s, "
         f"by {parting.gap_m:.2f} m."
@@ -188,12 +196,58 @@ def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
     ended = None if manifest is None else manifest.ended
     if rollout.ok and ended in ENDED:
         sentences.append(f"The rollout ended since {ENDED[ended]}.")
-    return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log)
+    return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log, failure)
+
+
+def _measured(
+    run: Run, rollout: Rollout, log: RolloutLog, first: DriveEvent | None, failed_us: int | None
+) -> Failure | None:
+    """Measure the seconds before a failure, or before an end short of the path's; None where a
+    rollout had neither.
+    """
+    outcomes = outcomes_of(rollout)
+    if failed_us is None and ending_of(rollout) == SHORT_OF_END:
+        failed_us = int(log.ego.t_us[-1])
+    if failed_us is None:
+        return None
+    manifest = run.manifest(rollout)
+    contact = None
+    if manifest is not None and first is not None:
+        contact = contact_of_failure(log, first, manifest.contacts)
+    content = run.scene_data(rollout.scene) or {}
+    return Failure.of(log, failed_us, outcomes, contact, content)
+
+
+def _evidence(run: Run, rollout: Rollout, failure: Failure | None) -> list[str]:
+    """Return what the run shows of a failure: what decides it among its rollouts, what happened
+    before it, what else they have in common.
+    """
+    common = common_to_failures(run, rollout)
+    facts = [] if failure is None else failure_facts(failure)
+    return [
+        *(one.sentence for one in common if one.decisive),
+        *facts[:1],
+        *behind_others(run, rollout),
+        *facts[1:],
+        *(one.sentence for one in common if not one.decisive),
+    ]
+
+
+def _telling_notes(check: PolicyCheck, outcomes: frozenset[str]) -> list[str]:
+    """Return what the check noted of a policy that has to do with its outcomes. It is about the
+    policy, and stands behind what is about this failure.
+    """
+    notes = sorted(check.notes, key=lambda note: note[0] != "lag")
+    return [f"{CHECK}{text}." for name, text in notes if outcomes & {*TELLING.get(name, ())}]
 
 
 def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
     """Return the log of a rollout; of one that broke off, the part that was written."""
     path = run.file_of(rollout, LOG_NAME) or run.file_of(rollout, f"{LOG_NAME}.part")
+    manifest = run.manifest(rollout)
+    if path is None and manifest is not None and manifest.log is not None:
+        # As it was named to simrun score, so from the same working directory.
+        path = Path(manifest.log) if Path(manifest.log).is_file() else None
     if path is None:
         return None
     try:
@@ -240,7 +294,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
     """
     rollout = cause.rollout
     path = run.folder / rollout.path / WHY_NAME
-    document: JsonObject = {"queries": [], "lens": None, "failed": None}
+    document: JsonObject = {"queries": [], "lens": None, "failed": None, "drive": None}
     if cause.log is not None:
         log = cause.log
         content, recorded = scene_of(run, cause.rollout.scene)
@@ -255,6 +309,7 @@ def write_cause(run: Run, cause: Cause) -> Path:
             "lens": lens_data(cameras[0], WIDTH_PX) if cameras else None,
             "failed": None if cause.failed_us is None else place.ms([cause.failed_us])[0],
             "queries": _queries(run, cause, log, place),
+            **_drive(cause, log, place),
         }
     names = dict.fromkeys(name for query in document["queries"] for name in query["seen"])
     html = fill(
@@ -266,11 +321,128 @@ def write_cause(run: Run, cause: Cause) -> Path:
         document=Markup(as_json(document)),
         renderers=[name for name in names if name != rollout.renderer],
         has_images=bool(names),
+        has_drive=document["drive"] is not None,
         run=real(run.folder).name,
         report="../" * len(Path(rollout.path).parts) + "report.html",
     )
     write_text(path, html)
     return path
+
+
+def _drive(cause: Cause, log: RolloutLog, place: Place) -> JsonObject:
+    """Return what the page draws of the motion: the drive from above, the curves of the seconds
+    before the failure, and the span of time that they have in common.
+    """
+    shown = shown_plans(log, cause.failed_us)
+    size = [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)]
+    moments = []
+    if cause.failed_us is not None:
+        is_contact = cause.failure is not None and cause.failure.contact is not None
+        kind = "collision" if is_contact else "event"
+        moments = [{"t": place.ms([cause.failed_us])[0], "kind": kind, "text": cause.outcome}]
+    curves = curve_data(cause.failure, place)
+    ends = [t for curve in curves for line in curve["lines"] for t in line["t"]]
+    ends += place.ms([plan.now_us for plan in shown]) or place.ms(log.ego.t_us[[0, -1]])
+    return {
+        "drive": {
+            "renderer": cause.rollout.renderer,
+            "ego": place.track(log.ego),
+            "size": size,
+            "users": list(range(len(log.actors))),
+            "plans": [
+                {"t": place.ms([plan.now_us])[0], "lines": plan_lines(plan, place)}
+                for plan in shown
+            ],
+            "moments": moments,
+        },
+        "curves": curves,
+        "span": [min(ends), max(max(ends), min(ends) + 1)],
+    }
+
+
+def curve_data(failure: Failure | None, place: Place) -> list[JsonObject]:
+    """Return speed, gap and lateral offset in the seconds before a failure, each with its lines: t
+    in milliseconds, v with nulls where there is no value.
+
+    Args:
+        failure: The measured failure; None where nothing could be measured.
+        place: Where times count from.
+    """
+    approach = None if failure is None else failure.approach
+    if failure is None or approach is None:
+        return []
+
+    def line(name: str, kind: str, values: F64) -> JsonObject:
+        return {"name": name, "kind": kind, "t": place.ms(approach.t_us), "v": rounded(values)}
+
+    speed_lines = [
+        line("ego", "ego", approach.speed_mps),
+        line("recording, at the same place", "recorded", approach.recorded_mps),
+    ]
+    if approach.limit_mps is not None:
+        posted = np.full(len(approach.t_us), approach.limit_mps)
+        speed_lines.append(line("posted, at the last place", "posted", posted))
+    curves = [("Speed", "m/s", speed_lines)]
+    actor_id = failure.nearest_id
+    if actor_id is not None:
+        gaps = gap_series(failure.log, approach.t_us, actor_id)
+        name = f"to {kind_of(failure.log.actors[actor_id])} {actor_id}"
+        curves.append(("Gap", "m", [line(name, "ego", gaps)]))
+    offset = line("of the recorded path, left is above", "ego", approach.lateral_m)
+    curves.append(("Lateral offset", "m", [offset]))
+    return [
+        {"name": name, "unit": unit, "lines": lines, "text": f"{name} in {unit} before the failure"}
+        for name, unit, lines in curves
+    ]
+
+
+# The end of a value's name -> its unit: a number of `Plan.debug` is shown with a unit alone.
+UNITS = {
+    "_mps2": "m/s2",
+    "_mps": "m/s",
+    "_kmh": "km/h",
+    "_mph": "mph",
+    "_m": "m",
+    "_cm": "cm",
+    "_s": "s",
+    "_ms": "ms",
+    "_us": "us",
+    "_rad": "rad",
+    "_radps": "rad/s",
+    "_deg": "deg",
+    "_1pm": "1/m",
+    "_1pm2": "1/m2",
+    "_hz": "Hz",
+    "_px": "px",
+    "_percent": "%",
+}
+
+
+def with_units(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Return names and texts of a policy's debug output: words as they are, numbers with the unit
+    that ends their name, and no number without one.
+
+    Example:
+        >>> with_units([["mode", "lane"], ["gap_m", "3.2"], ["score", "0.7"]])
+        [['mode', 'lane'], ['gap_m', '3.2 m']]
+    """
+    shown = []
+    for name, text in rows:
+        unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+        if not _is_number(text):
+            shown.append([name, text])
+        elif unit:
+            shown.append([name, f"{text} {unit}"])
+    return shown
+
+
+def _is_number(text: str) -> bool:
+    """Tell whether a text is a number, or a list of numbers."""
+    parts = text.strip("[]").split(",") if text.startswith("[") else [text]
+    try:
+        return all(np.isscalar(float(part)) for part in parts)
+    except ValueError:
+        return False
 
 
 def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[JsonObject]:
@@ -298,6 +470,7 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
         debug_facts["lines"] = [
             [name, _in_world(pose, xy, place)] for name, xy in debug_facts["lines"]
         ]
+        debug_facts["text"] = with_units(debug_facts["text"])
         debug_facts["boxes"] = [
             [name, *(round(scale * side, 1) for side in box)]
             for name, boxes in debug_facts["boxes"]

@@ -13,15 +13,14 @@ from rich.text import Text
 from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
-from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.presets import contact_note
 from evaluators.metrics.score_table import SCORES
-from evaluators.pages.flips import find_flips
 from evaluators.pages.overview import TONES, Overview
 from evaluators.pages.tables import metric_rows
 from evaluators.results import Summary
 from evaluators.statistics.numbers import labelled
 from evaluators.statistics.opening import Run
+from evaluators.statistics.outcomes import worst_of
 
 STYLES = {"worse": "red", "better": "green", "mixed": "yellow", "unclear": "yellow", "neutral": ""}
 MOST_NAMED = 6  # variants whose failures are named
@@ -226,10 +225,9 @@ def next_command(run: Run) -> tuple[list[str], str]:
     if failed:
         words = ["simrun", "check", "run", str(run.folder)]
         return words, "says what is damaged or missing; the same command runs it again"
-    flips, _ = find_flips(run)
-    changed = [rollout for flip in flips for rollout in (flip.other, flip.base)]
-    for rollout in [*changed, *run.rollouts]:
-        if outcomes_of(rollout):
-            words = ["simrun", "why", f"{run.folder}/{cell_name(*rollout.cell)}"]
-            return words, "what the policy saw and planned there"
+    worst = worst_of(run.rollouts)
+    if worst is not None:
+        name = worst.path if worst.log else cell_name(*worst.cell)
+        words = ["simrun", "why", f"{run.folder}/{name}"]
+        return words, "what the policy saw and planned there"
     return ["simrun", "view", str(run.folder)], "replays the rollouts side by side in a browser"

@@ -1,5 +1,6 @@
 """Which plans the page of a failure shows."""
 
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,13 @@ from alpasim_plugin.runs.scoring import tabulate
 from evaluators import score
 from evaluators.metrics.outcomes import first_failure
 from evaluators.pages.cause import AFTER_US, BEFORE_US, MOST_QUERIES, commands, shown_plans
-from evaluators.pages.evidence import asked_mps, contact_of_failure, plan_facts, words_of
+from evaluators.statistics.evidence import (
+    Failure,
+    asked_mps,
+    contact_of_failure,
+    failure_facts,
+    words_of,
+)
 from tests.evaluators.eval_build import TWO_LANES, car, rollout, scene, track
 
 STEP_US = 50_000
@@ -102,7 +109,7 @@ def test_a_contact_after_the_failure_is_not_what_it_failed_with():
     offroad = DriveEvent("offroad", 3_000_000, 3.0, 24.0, 0.0)
     assert contacts[0].t_s > offroad.t_s
     assert contact_of_failure(log, offroad, contacts) is None
-    sentences = plan_facts(log, offroad.t_us, frozenset({"offroad"}), None)
+    sentences = failure_facts(Failure.of(log, offroad.t_us, frozenset({"offroad"}), None, {}))
     assert not any("leads into" in text or "brakes" in text for text in sentences)
 
 
@@ -117,16 +124,16 @@ def test_a_contact_of_the_warm_up_is_not_what_it_failed_with():
 
 def test_evidence_about_a_contact_says_who_is_where_and_counts_from_the_contact_itself():
     log, failure, contacts = drive_into(40.0)
-    facts = plan_facts(
-        log,
-        failure.t_us,
-        frozenset({"collision_any"}),
-        contact_of_failure(log, failure, contacts),
-    )
-    assert facts[0].endswith("before the failure leads into the car ahead (`stands`).")
+    contact = contact_of_failure(log, failure, contacts)
+    facts = failure_facts(Failure.of(log, failure.t_us, frozenset({"collision_any"}), contact, {}))
+    assert facts[0].startswith("In the last second no plan brakes, at 8.0 m/s")
+    assert facts[0].endswith("leads into the car ahead (`stands`).")
+    # 16 m before it: 8 m/s end with 2 m/s2 after 16 m
+    assert facts[1].startswith("No plan of the 4.4 s before the contact brakes")
+    assert re.search(r"braking with 2\.[01] m/s2 from 2.0 s before on would", facts[1])
     # touched at 4.42 s; the plan of 1.5 s is the first that reaches so far
-    assert facts[0].startswith("Every plan of the last 2.9 s")
-    assert facts[1].startswith("No plan brakes")
+    assert facts[2].startswith("Every plan of the last 2.9 s")
+    assert facts[2].endswith("before the failure leads into the car ahead (`stands`).")
 
 
 def test_who_was_touched_is_named_by_kind_and_place():

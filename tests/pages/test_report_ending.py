@@ -3,6 +3,7 @@
 import dataclasses
 
 from evaluators.metrics.outcomes import outcomes_of
+from evaluators.pages.cause import worst_failure
 from evaluators.pages.terminal import next_command
 from evaluators.statistics.opening import read_run
 from tests.docs.parsed_commands import parse
@@ -31,6 +32,7 @@ def test_a_drive_that_ended_with_an_event_leads_to_its_cause(usual_run):
         one for one in run.rollouts if one.cell == (renderer, policy, "/".join(scene), int(seed))
     )
     assert outcomes_of(ended)
+    assert worst_failure(run) == ended
 
 
 def test_a_quiet_run_leads_to_its_replay_and_a_failing_policy_to_its_check(

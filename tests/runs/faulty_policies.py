@@ -261,12 +261,12 @@ FAULTS = {
         Centimetres: "centimetres",
         SwappedAxes: "in the rig frame x is forward",
         EmptyPlan: "(0, 2)",
-        ConstantPlan: "route_rig changed no plan",
+        ConstantPlan: "get the same plan",
         Jitter: "from query to query",
-        StopsForever: "standstill",
+        StopsForever: "where the recording drives",
     },
     "hard/hard_brake": {
-        BlindToCars: "images changed no plan",
+        BlindToCars: "no plan brakes",
         BrakesLate: "leads into the car ahead (`leader`)",
     },
     "smoke/curve": {
@@ -274,7 +274,7 @@ FAULTS = {
         LateImages: "queries late",
         SwappedChannels: "red and blue",
     },
-    "urban/junction_right": {IgnoresRoute: "route_rig changed no plan"},
+    "urban/junction_right": {IgnoresRoute: "of a right-hand bend"},
 }
 # Words that name a cause: beside a fault of another kind they are false.
 CAUSES = (

@@ -238,6 +238,7 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> JsonObject:
             "left": _xy(lane.left) if lane.left is not None else None,
             "right": _xy(lane.right) if lane.right is not None else None,
             "markings": [lane.left_mark_type, lane.right_mark_type],
+            "limit_mps": lane.speed_limit_mps,
         }
         for lane in scene.lane_map.lanes.values()
     ]

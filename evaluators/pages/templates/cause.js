@@ -8,18 +8,33 @@ const why = {
     const { data } = this, { queries } = data, scrub = byId("scrub");
     document.addEventListener("keydown", (event) => this.key(event));
     for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", () => this.copy(button));
-    if (!queries.length || !data.lens) return;
+    if (!data.drive) return;
+    this.charts = data.curves.map((curve) => chart(curve, data.failed, data.span));
+    byId("curves").replaceChildren(...this.charts.map(({ node }) => node));
+    this.above = new Birdseye(byId("above"), { renderers: [data.own] });
+    this.above.load({ map: data.map, users: data.users, drives: [data.drive] });
+    this.above.onView = () => this.look();
+    new ResizeObserver(() => this.look()).observe(byId("above"));
+    byId("theme").addEventListener("click", () => { this.above.readColours(); this.look(); });
+    if (!queries.length) { this.look(); return; }
     const boxes = [...document.querySelectorAll("#layers input")];
     const read = () => { this.wanted = new Set(boxes.filter((one) => one.checked).map((one) => one.value)); };
     boxes.forEach((one) => one.addEventListener("change", () => { read(); this.show(this.i); }));
     read();
-    this.stages = [...document.querySelectorAll("figure[data-renderer]")].map((figure) => ({ name: figure.dataset.renderer, canvas: figure.querySelector("canvas"), said: figure.querySelector("small") }));
+    this.stages = data.lens ? [...document.querySelectorAll("figure[data-renderer]")].map((figure) => ({ name: figure.dataset.renderer, canvas: figure.querySelector("canvas"), said: figure.querySelector("small") })) : [];
     scrub.max = String(queries.length - 1);
     scrub.addEventListener("input", () => this.show(Number(scrub.value)));
     byId("before").addEventListener("click", () => this.show(this.i - 1));
     byId("after").addEventListener("click", () => this.show(this.i + 1));
     const first = data.failed === null ? queries.length - 1 : queries.findLastIndex((query) => query.t <= data.failed - 800);
     this.show(Math.max(0, first));
+  },
+
+  // The view from above and the marks in the curves, at the chosen query or else at the failure.
+  look() {
+    const { data } = this, t = data.queries[this.i]?.t ?? data.failed ?? data.drive.ego.t.at(-1);
+    this.above.draw(t, 0, new Set());
+    for (const { head } of this.charts) head.setAttribute("transform", `translate(${share(t, data.span).toFixed(1)} 0)`);
   },
 
   show(i) {
@@ -30,6 +45,7 @@ const why = {
     const before = data.failed === null ? "" : query.t <= data.failed ? `, ${seconds(data.failed - query.t)} s before the failure` : ", after the failure";
     byId("when").textContent = `${seconds(query.t)} s${before}; ${query.speed} m/s`;
     byId("scrub").setAttribute("aria-valuetext", byId("when").textContent);
+    this.look();
     this.drawn = Promise.all(this.stages.map((stage) => this.draw(stage, query, this.i)));
     this.tell(query);
   },
@@ -87,6 +103,28 @@ const why = {
     const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
     if (step && this.stages && event.target.id !== "scrub") { event.preventDefault(); this.show(this.i + step); }
   },
+};
+
+const PLOT = { width: 1000, height: 100 };
+const share = (t, [from, to]) => ((t - from) / (to - from)) * PLOT.width;
+
+// One quantity over time: lines of t (ms) and v, the failure as a red line, and a mark at the chosen query.
+const chart = ({ name, unit, lines, text }, failed, span) => {
+  const values = lines.flatMap(({ v }) => v.filter((one) => one !== null));
+  let low = Math.min(0, ...values), high = Math.max(0, ...values);
+  if (high - low < 0.5) high = low + 0.5;
+  const margin = 0.06 * (high - low);
+  const y = (v) => PLOT.height - ((v - low + margin) / (high - low + 2 * margin)) * PLOT.height;
+  const svg = svgNode("svg", { viewBox: `0 0 ${PLOT.width} ${PLOT.height}`, preserveAspectRatio: "none", role: "img", "aria-label": text });
+  svg.append(svgNode("line", { class: "zero", x1: 0, x2: PLOT.width, y1: y(0), y2: y(0) }));
+  if (failed !== null) svg.append(svgNode("line", { class: "failed", x1: share(failed, span), x2: share(failed, span), y1: 0, y2: PLOT.height }));
+  const head = svg.appendChild(svgNode("line", { class: "head", x1: 0, x2: 0, y1: 0, y2: PLOT.height }));
+  for (const line of lines) svg.append(svgNode("path", { class: `line ${line.kind}`, d: linePath(line, (t) => share(t, span), y) }));
+  const node = make("figure", "curve"), plot = make("div", "plot"), caption = make("figcaption", "small");
+  plot.append(svg, make("span", "limit top num", `${shortNumber(high)} ${unit}`), make("span", "limit bottom num", shortNumber(low)));
+  caption.append(make("b", "", name), ...lines.map((line) => make("span", `key ${line.kind}`, line.name)));
+  node.append(caption, plot);
+  return { node, head };
 };
 
 const load = (kind, data) => createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))], { type: "image/" + kind }));
