@@ -97,7 +97,10 @@ def view(
         "of": len(made.all_cells),
         "notes": list(made.notes),
     }
-    size = f"{made.size / MB:.1f} MB, {len(made.cells)} of {len(made.all_cells)} rollouts"
+    n_shown, n_all = (
+        sum(len(cell.rollouts) for cell in cells) for cells in (made.cells, made.all_cells)
+    )
+    size = f"{made.size / MB:.1f} MB, {n_shown} of {n_all} rollouts"
     lines = [
         *(f"note     {note}" for note in made.notes),
         f"page     {shlex.quote(str(page))}, {size}",

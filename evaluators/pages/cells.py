@@ -398,6 +398,7 @@ def index_data(
     for name in run.table.ordered({*run.table, *(name for table in tables for name in table)}):
         metric = run.table.shown(name)
         metrics[name] = {"unit": metric.unit, "help": metric.help, "flag": metric.is_flag}
+        metrics[name] |= {"label": metric.label}
     bases = [cell.side(flip.base) for cell in cells for flip in cell.flips]
     rows = []
     for cell in cells:

@@ -7,6 +7,7 @@ from urllib.parse import quote
 
 import pytest
 
+from evaluators.metrics import METRICS
 from evaluators.pages.cells import Wanted
 from evaluators.pages.html import write_report
 from evaluators.pages.page import write_page
@@ -190,8 +191,10 @@ def test_curves_show_where_no_value_is_valid_and_what_is_not_chosen_is_gone(brow
     settled(browser)
     browser.evaluate("player.open(player.index.cells.find(c => c.scene === 'urban-left_turn').id)")
     settled(browser)
-    names = "[...document.querySelectorAll('#curves h3')].map(h => h.firstChild.textContent === '' ? '' : h.textContent)"
-    assert any("min_distance_to_obstacle" in name for name in browser.evaluate(names))
+    names = browser.evaluate("[...document.querySelectorAll('#curves h3')].map(h => h.textContent)")
+    label = METRICS.shown("min_distance_to_obstacle_m").label
+    assert "_" not in label
+    assert any(label in name for name in names)
     assert "no other road user" in browser.evaluate(
         "document.querySelector('#curves .why').textContent"
     )

@@ -36,10 +36,13 @@ class Curves {
       this.draw();
       this.show(this.t);
     });
-    label.title = this.index.metrics[name]?.help ?? "";
-    label.append(box, make("span", "", name));
+    label.title = [name, this.index.metrics[name]?.help].filter(Boolean).join(": ");
+    label.append(box, make("span", "", this.label(name)));
     return label;
   }
+
+  // What a metric is called; a run of an earlier version may not say.
+  label(name) { return this.index.metrics[name]?.label || name.replaceAll("_", " "); }
 
   draw() {
     this.charts = this.names.filter((name) => this.chosen.has(name)).map((name) => this.chart(name));
@@ -68,10 +71,9 @@ class Curves {
     const x = (t) => ((t - this.from) / (this.to - this.from)) * CHART.width;
     const y = (v) => CHART.height - ((v - low + margin) / (high - low + 2 * margin)) * CHART.height;
     const node = make("section", "curve"), head = make("header");
-    const title = make("h3");
-    name.split("_").forEach((part, i) => title.append(...(i ? ["_", make("wbr")] : []), part));
-    title.title = facts.help;
-    if (facts.unit && !name.endsWith("_" + facts.unit)) title.append(make("small", "muted", " " + facts.unit));
+    const title = make("h3", "", this.label(name));
+    title.title = [name, facts.help].filter(Boolean).join(": ");
+    if (facts.unit) title.append(make("small", "muted", " " + facts.unit));
     const now = make("div", "now num");
     head.append(title, now);
     const plot = make("div", "plot");
@@ -123,7 +125,7 @@ class Curves {
       const gaps = invalidParts(curve).length ? `, ${curve.v.length - valid.length} of ${curve.v.length} values not valid` : "";
       return `${renderer}: ${shortNumber(Math.min(...valid))} to ${shortNumber(Math.max(...valid))} ${facts.unit}${gaps}`;
     };
-    return `${name} over time. ${drives.map(of).join("; ")}`;
+    return `${this.label(name)} over time. ${drives.map(of).join("; ")}`;
   }
 
   show(t) {
