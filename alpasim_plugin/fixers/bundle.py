@@ -4,8 +4,8 @@ with.
 Keys carry their part. A bundle of the kind ``per-frame`` has ``generator.``; those of latent fixers
 (``block``, ``render-step``, ``noise-window``) have ``dit.``, ``vae.``, ``decoder.`` (where it is
 not the autoencoder's) and ``prompt.text``.
-The header holds ``format``, ``kind``, ``trained``, ``note`` and ``settings``, the JSON of the
-settings that the weights were trained with. Only safetensors is read: a pickle is refused.
+The header holds ``format``, ``kind``, ``trained``, ``note``, ``settings`` (the JSON of the settings
+that the weights were trained with), and ``updates`` where they were trained from nothing. Only safetensors is read: a pickle is refused.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from alpasim_plugin.fixers.network.checkpoints import StateDict
 
 FORMAT = "simrun-fixer-1"
+HARDLY_UPDATES = 50  # from nothing: weights of fewer are marked wherever the fixer is named
 FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
 S = TypeVar("S", bound=WeightedSettings)
 
@@ -79,8 +80,8 @@ class FixerFactory(Generic[S]):
                     f"correct --set fixer.{key}, or where it is written",
                 )
         if "weights.bundle" in files:
-            trained = read_metadata(files["weights.bundle"]).get("trained") == "true"
-            return Declaration(files, trained, "trained" if trained else "untrained")
+            header = read_metadata(files["weights.bundle"])
+            return Declaration(files, header.get("trained") == "true", training_words(header))
         trained = "weights.dit" in files
         note = "weights of a checkpoint" if trained else f"untrained ({settings.untrained})"
         lacking = [part for part in settings.needed_weights if f"weights.{part}" not in files]
@@ -89,6 +90,25 @@ class FixerFactory(Generic[S]):
         note = f"weights missing: {lacking[0]}" if files else "weights missing"
         do = weights_to_give(lacking[0], getattr(settings, "trained_by", None))
         return Declaration(files, trained, note, missing=do)
+
+
+def training_words(header: Mapping[str, str]) -> str:
+    """Say how far the weights of a bundle are trained.
+
+    Example:
+        >>> training_words({"trained": "true", "updates": "4"}), training_words({"trained": "true"})
+        ('hardly trained: 4 updates', 'trained')
+    """
+    if header.get("trained") != "true":
+        return "untrained"
+    updates = header.get("updates", "")
+    if updates.isdecimal() and int(updates) < HARDLY_UPDATES:
+        return f"hardly trained: {_updates(int(updates))}"
+    return "trained"
+
+
+def _updates(updates: int) -> str:
+    return "1 update" if updates == 1 else f"{updates} updates"
 
 
 def weights_to_give(part: str, trained_by: str | None = None) -> str:
@@ -119,6 +139,7 @@ def save_bundle(
     *,
     trained: bool,
     note: str = "",
+    updates: int | None = None,
 ) -> None:
     """Write a bundle atomically.
 
@@ -129,6 +150,8 @@ def save_bundle(
         settings: What the weights were trained with.
         trained: Whether they were learned.
         note: Description for labels.
+        updates: Of a training that began from nothing; None where it went on from other weights,
+            or is not known.
 
     Raises:
         InputError: A part that is not known, or one that is missing.
@@ -149,6 +172,8 @@ def save_bundle(
         "note": note,
         "settings": json.dumps(plain),
     }
+    if updates is not None:
+        header["updates"] = str(updates)
     write_safetensors(path, tensors, header)
 
 
@@ -194,7 +219,8 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
             f"write it with save_bundle (parts {', '.join(sorted(kind.needed | kind.optional))})",
         )
     trained = header.get("trained") == "true"
-    notes = ["" if trained else "untrained", header.get("note", ""), *others]
+    words = training_words(header)
+    notes = ["" if words == "trained" else words, header.get("note", ""), *others]
     return Bundle(parts, trained, ", ".join(filter(None, notes)) or "trained")
 
 

@@ -10,6 +10,7 @@ import torch
 
 from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.interfaces import BlockRule
+from alpasim_plugin.core.parts.resolve import resolve
 from alpasim_plugin.fixers import fixer_settings, guard, make_fixer
 from alpasim_plugin.fixers.bundle import bundle_header, read_bundle, save_bundle
 from alpasim_plugin.fixers.guard import render_share
@@ -18,7 +19,16 @@ from alpasim_plugin.fixers.pixel_network import load_generator
 from alpasim_plugin.fixers.pixel_settings import PixelFixerSettings
 from tests.block_fixers.fixer_cases import small_settings
 from tests.fixers.clip_cases import SIZE, maps_of, moving_picture, pixels
-from tests.fixers.pixel_cases import FRAMES, MAPS, SIZES, at, run, session, write_bundle
+from tests.fixers.pixel_cases import (
+    FRAMES,
+    MAPS,
+    SIZES,
+    at,
+    generator,
+    run,
+    session,
+    write_bundle,
+)
 
 
 @pytest.fixture(scope="module")
@@ -262,3 +272,24 @@ def test_weights_that_were_replaced_under_their_name_are_read_again(tmp_path):
     other = {"generator": PixelGenerator(SIZES).state_dict()}
     save_bundle(file, other, settings, trained=True, note="10 updates")
     assert load_generator(at(file)).note == "10 updates"
+
+
+@pytest.mark.parametrize(
+    ("updates", "words"),
+    [(4, "hardly trained: 4 updates"), (1, "hardly trained: 1 update"), (50, "trained")],
+)
+def test_a_fixer_of_few_updates_is_marked_where_it_is_named(tmp_path, updates, words):
+    path = tmp_path / "few.safetensors"
+    settings = fixer_settings("onefixer", ["weights.bundle=null", "holes=noise"])
+    save_bundle(
+        path,
+        {"generator": generator().state_dict()},
+        settings,
+        trained=True,
+        note="first try",
+        updates=updates,
+    )
+    spec = resolve("fixer", "onefixer", (f"weights.bundle={path}", "holes=noise"))
+    assert spec.note == words
+    assert spec.label == f"onefixer, {words}"
+    assert (words in session(path).label) == (updates < 50)

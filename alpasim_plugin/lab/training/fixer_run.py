@@ -390,6 +390,8 @@ def _write_weights(
         deployed_settings(run, stage),
         trained=True,
         note=_note(run, stage, updates, schedule),
+        # A later stage, or one of given weights, goes on from others.
+        updates=None if run.weights or {*stage.sources} - {*GIVEN} else updates,
     )
 
 

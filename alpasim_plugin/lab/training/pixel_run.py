@@ -177,7 +177,12 @@ def write_bundle(run: PixelRun, path: Path, weights: Mapping[str, Tensor], updat
     tensors: dict[str, Any] = {key: half(value) for key, value in weights.items()}
     named = "" if run.variant.name == DEPLOYED else f"{run.variant.name}, "
     save_bundle(
-        path, {"generator": tensors}, settings, trained=True, note=f"{named}{updates} updates"
+        path,
+        {"generator": tensors},
+        settings,
+        trained=True,
+        note=f"{named}{updates} updates",
+        updates=updates if run.init is None else None,
     )
     return path
 
