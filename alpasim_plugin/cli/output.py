@@ -6,6 +6,7 @@ import os
 import shlex
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from alpasim_plugin.core.printing import say, say_document
 from alpasim_plugin.core.printing import warn as warn
 from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import STAGES
-from evaluators.statistics.numbers import plural
+from evaluators.statistics.numbers import duration, plural
 
 if TYPE_CHECKING:  # verbs that only read a run load neither the loop nor its kernels
     from alpasim_plugin.core.types import Scenario
@@ -87,6 +88,51 @@ def letters_of(table: Table) -> int:
     return Console(width=MOST_LETTERS).measure(table).maximum
 
 
+KERNELS_NOTE = ", which compiles kernels once"
+PACE_STEPS = 20  # of a long stage, by which its time is estimated
+LONG_STEPS = 200
+LONG_S = 60.0
+
+
+@dataclass
+class Pace:
+    """How fast a stage begins.
+
+    Attributes:
+        first: How much was done when it was first seen.
+        began_s: When that was.
+        is_said: Whether its estimate was given.
+    """
+
+    first: int
+    began_s: float
+    is_said: bool = False
+
+    def estimate(self, stage: str, done: int, total: int, now_s: float) -> str:
+        """Return how long a stage of many steps will take, once `PACE_STEPS` are done; empty before
+        and after, and where it is short.
+
+        Example:
+            >>> pace = Pace(0, 10.0)
+            >>> pace.estimate("fitting", 20, 3000, 20.0)
+            'fitting: 3000 steps, about 25 min at the pace of the first 20; later ones may be slower'
+            >>> pace.estimate("fitting", 21, 3000, 20.5)
+            ''
+        """
+        steps = done - self.first
+        if self.is_said or steps < PACE_STEPS or total - self.first < LONG_STEPS:
+            return ""
+        self.is_said = True
+        whole_s = (now_s - self.began_s) / steps * (total - self.first)
+        if whole_s < LONG_S:
+            return ""
+        span = duration(whole_s).replace("\u00a0", " ")
+        return (
+            f"{stage}: {total - self.first} steps, about {span} at the pace of the first {steps}; "
+            f"later ones may be slower"
+        )
+
+
 class Progress(progress.Progress):
     """Progress on standard error: a bar on a terminal, lines on a pipe; silent, only warnings."""
 
@@ -104,6 +150,8 @@ class Progress(progress.Progress):
         )
         self.silent = silent
         self.printed_s = time.monotonic()
+        self.kernels_named = False  # that they are compiled is said once
+        self.paces: dict[str, Pace] = {}
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""
@@ -118,6 +166,9 @@ class Progress(progress.Progress):
         task = self.tasks[-1]
         self.update(task.id, completed=done, total=total)
         now_s = time.monotonic()
+        pace = self.paces.setdefault(stage, Pace(done, now_s))
+        if total is not None and (sentence := pace.estimate(stage, done, total, now_s)):
+            self.say(sentence)
         if self.disable and (is_new or now_s - self.printed_s > LINE_EVERY_S):
             self.printed_s = now_s
             whole = "" if total is None else f"/{total}"
@@ -136,17 +187,27 @@ class Progress(progress.Progress):
         """Show what a worker does, until the run ends; on a pipe every ten seconds."""
         while not self.finished:
             time.sleep(1.0)
-            for text in stages_in(folder)[:1]:
+            for stated in stages_in(folder)[:1]:
+                text = self.without_known(stated)
                 self.update(self.tasks[-1].id, description=f"rollouts; {terminal(text)}")
                 now_s = time.monotonic()
                 if self.disable and now_s - self.printed_s > LINE_EVERY_S:
                     self.printed_s = now_s
                     self.say(text)
 
+    def without_known(self, text: str) -> str:
+        """Return what a worker does, without the note on kernels where it was said before."""
+        if self.kernels_named:
+            return text.removesuffix(KERNELS_NOTE)
+        # A bar shows it as long as the stage lasts; a pipe has it in one line.
+        self.kernels_named = self.disable and text.endswith(KERNELS_NOTE)
+        return text
+
     def rollout_done(self, manifest: Manifest, reused: bool) -> None:
         """Count a rollout and print its result; on a terminal only failures."""
         task = self.tasks[-1]
         self.advance(task.id)
+        self.kernels_named = True
         done = int(task.completed)
         total = int(task.total or 0)
         is_shown = done == total or done % max(1, total // MAX_LINES) == 0
