@@ -9,6 +9,7 @@ READERS = {
     "evaluators.statistics.sentences": {"*"},
     "evaluators.statistics.boundary_words": {"*"},
     "evaluators.statistics.opening": {"Run", "read_run"},
+    "evaluators.statistics.cause": {"Cause", "Parting"},
     "evaluators.statistics.decision": {
         "CAUSES",
         "Decision",

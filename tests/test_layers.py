@@ -273,6 +273,7 @@ MAKERS = {
     # The question that a run drives until it is decided, and whether a baseline is one of its own.
     "run": {"Question", "base_named", "load_gate", "metric_question", "variants_of"},
     "score": {"worst_code"},  # of several presets
+    "why": {"worst_failure"},  # the rollout that a run stands for
 }
 
 

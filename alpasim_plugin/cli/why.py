@@ -8,9 +8,10 @@ from alpasim_plugin.cli.options import Json, run_and_cell
 from alpasim_plugin.cli.output import show, warn
 from alpasim_plugin.core.flags import Positional
 from alpasim_plugin.runs.logged_rollout import named_rollout
-from alpasim_plugin.runs.reports import divergences_of
+from alpasim_plugin.runs.reports import failure_cause
 from alpasim_plugin.runs.tables import ensure_tables
-from evaluators.pages.cause import cause_of, worst_failure, write_cause
+from evaluators.pages.cause import write_cause
+from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import read_run
 
 EPILOG = """
@@ -45,7 +46,7 @@ def why(
     ensure_tables(root, warn)
     run = read_run(root)
     rollout = named_rollout(run.rollouts, name) if name else worst_failure(run)
-    cause = cause_of(run, rollout, divergences_of(run, rollout))
+    cause = failure_cause(run, rollout)
     page = write_cause(run, cause)
     facts = {
         "rollout": rollout.path,

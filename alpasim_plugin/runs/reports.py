@@ -15,7 +15,7 @@ from alpasim_plugin.log.run_folder.schema import LOG_NAME, PAGES, REPORTS
 from alpasim_plugin.runs.film import beside
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.metrics.plan import DIVERGED_M, HORIZON_US, first_divergence
-from evaluators.pages.cause import cause_of, write_cause
+from evaluators.pages.cause import log_so_far, write_cause
 from evaluators.pages.cells import read_log
 from evaluators.pages.ci import write_junit, write_summary_md
 from evaluators.pages.flips import (
@@ -26,8 +26,10 @@ from evaluators.pages.flips import (
     key_of_entry,
 )
 from evaluators.pages.html import write_report
+from evaluators.pages.images import frame_rows
 from evaluators.pages.run_list import write_run_list
 from evaluators.pages.runs import find_runs
+from evaluators.statistics.cause import Cause, cause_of
 from evaluators.statistics.history import PastRun, changes_between
 from evaluators.statistics.opening import Run, read_run
 
@@ -51,7 +53,7 @@ def write_reports(root: Path, page: bool = True) -> Path | None:
             rollout.cell[:3]: rollout for rollout in reversed(run.rollouts) if outcomes_of(rollout)
         }
         for rollout in list(failed.values())[::-1][:MAX_CAUSES]:
-            write_cause(run, cause_of(run, rollout, divergences_of(run, rollout)))
+            write_cause(run, failure_cause(run, rollout))
     write_summary_md(run)
     write_junit(run)
     report = None
@@ -87,6 +89,12 @@ MAX_CAUSES = 12  # a run must not wait for its pages; `simrun why` writes any ot
 def divergences_of(run: Run, rollout: Rollout) -> list[JsonView]:
     """Return the entries of ``flips.json`` about a rollout; none where the file is absent."""
     return [entry for entry in flip_entries(run) if key_of_entry(entry)[:5] == rollout.key]
+
+
+def failure_cause(run: Run, rollout: Rollout) -> Cause:
+    """Return what the files of a run say of how a rollout ended."""
+    entries = divergences_of(run, rollout)
+    return cause_of(run, rollout, entries, log_so_far(run, rollout), frame_rows(run, rollout))
 
 
 MAX_FLIPS = 60  # rollouts whose logs are read

@@ -104,6 +104,14 @@ def gravity(rollout: Rollout) -> int:
     return next((rank for rank, name in enumerate(OUTCOMES) if name in had), len(OUTCOMES))
 
 
+def worst_of(rollouts: Iterable[Rollout]) -> Rollout | None:
+    """Return the rollout that failed worst: one that broke off, then the gravest outcome, then the
+    first; None where none failed.
+    """
+    failed = [rollout for rollout in rollouts if not rollout.ok or outcomes_of(rollout)]
+    return min(failed, key=lambda rollout: gravity(rollout) if rollout.ok else -1, default=None)
+
+
 def in_words(had: Iterable[str]) -> str:
     """Name outcomes.
 

@@ -4,43 +4,32 @@ poses, where plans part, and what to ask next.
 """
 
 import base64
+import os
 import shlex
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import inside, parsing, read_bytes, real
+from alpasim_plugin.core.files import parsing, read_bytes, real
 from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.geometry import interpolate, inverse, speeds, transform_points
-from alpasim_plugin.core.json_types import JsonObject, JsonView
+from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, CameraSpec, LoggedImage, LoggedPlan, RolloutLog
 from alpasim_plugin.log import decode_image, read_facts
 from alpasim_plugin.log.debug import WIDTH_PX, debug_row
 from alpasim_plugin.log.images import smaller
-from alpasim_plugin.log.run_folder.reader import last_output, read_json
-from alpasim_plugin.log.run_folder.records import DriveEvent, PolicyCheck
+from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
     LOG_NAME,
-    OUTPUT_NAME,
     SAME_POSES,
     WHY_NAME,
     cell_name,
-)
-from evaluators.metrics.outcomes import (
-    ENDED,
-    OUTCOMES,
-    SHORT_OF_END,
-    ending_of,
-    first_failure,
-    in_words,
-    outcomes_of,
 )
 from evaluators.pages.cells import lens_data, read_log
 from evaluators.pages.drive_data import (
@@ -51,203 +40,26 @@ from evaluators.pages.drive_data import (
     scene_of,
     user_data,
 )
-from evaluators.pages.images import frame_rows, jpeg, seen_before
+from evaluators.pages.images import jpeg
 from evaluators.pages.page import as_json, fill
 from evaluators.pages.rollouts import clock_zero_us
-from evaluators.statistics.alike import common_to_failures
-from evaluators.statistics.approach import gap_series
-from evaluators.statistics.evidence import (
-    Failure,
-    contact_of_failure,
-    failure_facts,
-    kind_of,
-)
+from evaluators.statistics.cause import Cause, Parting
 from evaluators.statistics.opening import Run
-from evaluators.statistics.outcomes import worst_of
 
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
 MOST_QUERIES = 48
 SCRIPTS = ("theme.js", "timeline.js", "birdseye.js", "overlay.js", "curves.js", "cause.js")
 STYLES = ("theme.css", "report.css", "cause.css")
-CHECK = "Check of the policy before the run: "
-# Notes of a check, and the outcomes beside which they are shown.
-TELLING = {
-    "lag": tuple(OUTCOMES),
-    "images": ("collision_any", "collision_at_fault", "offroad", "wrong_lane", "left_route"),
-    "route_rig": ("offroad", "wrong_lane", "left_route"),
-    "standstill": ("stalled",),
-}
-# Of a policy of simrun, or of one behind an address.
-UNCHECKED = PolicyCheck(None)
 
 
-@dataclass(frozen=True)
-class Parting:
-    """When plans part from those behind another renderer, or of another policy.
-
-    Attributes:
-        name: The renderer or the policy.
-        kind: ``renderer`` or ``policy``.
-        at_s: Seconds from the first camera frame to the first query at which they are apart.
-        gap_m: How far apart they are then.
-        images: The other's image and the own one at that query, JPEG in base64; none of a policy,
-            which sees the same.
-    """
-
-    name: str
-    kind: str
-    at_s: float
-    gap_m: float
-    images: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class Cause:
-    """What is known of how a rollout ended.
-
-    Attributes:
-        outcome: In words.
-        failed_us: When it failed first; None where it did not.
-        start_us: The first camera frame.
-        sentences: What the run shows, the most telling first.
-        partings: When plans part from others'.
-        log: As far as it was written; None where there is none.
-        failure: The seconds before it failed, measured; None where nothing could be measured.
-    """
-
-    rollout: Rollout
-    outcome: str
-    failed_us: int | None
-    start_us: int
-    sentences: Sequence[str]
-    partings: Sequence[Parting]
-    log: RolloutLog | None
-    failure: Failure | None = None
-
-    @property
-    def failed_s(self) -> float | None:
-        """Give when it failed, seconds from the first camera frame."""
-        return None if self.failed_us is None else (self.failed_us - self.start_us) * 1e-6
-
-
-def worst_failure(run: Run, rollouts: Sequence[Rollout] | None = None) -> Rollout:
-    """Return the rollout of a run that failed worst; see `worst_of`.
-
-    Args:
-        run: The run.
-        rollouts: Those of it that are compared; all by default.
-
-    Raises:
-        InputError: No rollout failed.
-    """
-    worst = worst_of(run.rollouts if rollouts is None else rollouts)
-    if worst is None:
-        raise InputError(
-            f"{run.folder}: no rollout of this run failed",
-            "Name a rollout: simrun why RUN/RENDERER/POLICY/SCENE/SEED.",
-        )
-    return worst
-
-
-def cause_of(run: Run, rollout: Rollout, entries: Sequence[JsonView]) -> Cause:
-    """Return what the files of a run say of how a rollout ended.
-
-    Args:
-        run: The run.
-        rollout: One of its rollouts.
-        entries: Entries of ``flips.json`` about it: when its plans part from those of others.
-
-    Raises:
-        InputError: A file of the run is damaged.
-    """
-    log = _log_so_far(run, rollout)
-    manifest = run.manifest(rollout)
-    first = None if manifest is None else first_failure(manifest.events)
-    failed_us = None if first is None else first.t_us
-    start_us = 0 if log is None else log.render_start_us
-    if log is not None and not rollout.ok:
-        failed_us = int(log.ego.t_us[-1])
-    partings = [
-        _parting_of(run, rollout, entry, start_us)
-        for entry in entries
-        if entry.get("t_us") is not None
-    ]
-    outcomes = outcomes_of(rollout)
-    outcome = in_words(outcomes) if outcomes else ending_of(rollout)
-    check = run.info.policy_checks.get(rollout.policy, UNCHECKED)
-    sentences = [f"{CHECK}{text}." for _, text in check.breaches]
-    if not rollout.ok:
-        outcome = f"{rollout.failure_class}: {rollout.failure}"
-        last_lines = last_output(run.folder / rollout.path / OUTPUT_NAME)
-        sentences = [*(sentences or [rollout.failure]), *last_lines]
-    failure = None
-    if log is not None and rollout.ok:
-        failure = _measured(run, rollout, log, first, failed_us)
-    sentences += _evidence(run, rollout, failure)
-    sentences += _telling_notes(check, outcomes)
-    sentences += [
-        f"Plans part from those of the {parting.kind} {parting.name} at {parting.at_s:.1f} s, "
-        f"by {parting.gap_m:.2f} m."
-        for parting in partings
-    ]
-    made_up = "" if failed_us is None else seen_before(frame_rows(run, rollout), failed_us)
-    sentences += [f"{made_up}."] if made_up else []
-    ended = None if manifest is None else manifest.ended
-    if rollout.ok and ended in ENDED:
-        sentences.append(f"The rollout ended since {ENDED[ended]}.")
-    return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log, failure)
-
-
-def _measured(
-    run: Run, rollout: Rollout, log: RolloutLog, first: DriveEvent | None, failed_us: int | None
-) -> Failure | None:
-    """Measure the seconds before a failure, or before an end short of the path's; None where a
-    rollout had neither.
-    """
-    outcomes = outcomes_of(rollout)
-    if failed_us is None and ending_of(rollout) == SHORT_OF_END:
-        failed_us = int(log.ego.t_us[-1])
-    if failed_us is None:
-        return None
-    manifest = run.manifest(rollout)
-    contact = None
-    if manifest is not None and first is not None:
-        contact = contact_of_failure(log, first, manifest.contacts)
-    content = run.scene_data(rollout.scene) or {}
-    return Failure.of(log, failed_us, outcomes, contact, content)
-
-
-def _evidence(run: Run, rollout: Rollout, failure: Failure | None) -> list[str]:
-    """Return what the run shows of a failure: what decides it among its rollouts, what happened
-    before it, what else they have in common.
-    """
-    common = common_to_failures(run, rollout)
-    facts = [] if failure is None else failure_facts(failure)
-    return [
-        *(one.sentence for one in common if one.decisive),
-        *facts[:1],
-        *behind_others(run, rollout),
-        *facts[1:],
-        *(one.sentence for one in common if not one.decisive),
-    ]
-
-
-def _telling_notes(check: PolicyCheck, outcomes: frozenset[str]) -> list[str]:
-    """Return what the check noted of a policy that has to do with its outcomes. It is about the
-    policy, and stands behind what is about this failure.
-    """
-    notes = sorted(check.notes, key=lambda note: note[0] != "lag")
-    return [f"{CHECK}{text}." for name, text in notes if outcomes & {*TELLING.get(name, ())}]
-
-
-def _log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
+def log_so_far(run: Run, rollout: Rollout) -> RolloutLog | None:
     """Return the log of a rollout; of one that broke off, the part that was written."""
     path = run.file_of(rollout, LOG_NAME) or run.file_of(rollout, f"{LOG_NAME}.part")
     manifest = run.manifest(rollout)
     if path is None and manifest is not None and manifest.log is not None:
         # As it was named to simrun score, so from the same working directory.
-        path = Path(manifest.log) if Path(manifest.log).is_file() else None
+        path = Path(manifest.log) if os.path.isfile(manifest.log) else None
     if path is None:
         return None
     try:
@@ -311,12 +123,14 @@ def write_cause(run: Run, cause: Cause) -> Path:
             "queries": _queries(run, cause, log, place),
             **_drive(cause, log, place),
         }
+    pairs = [(parting, _images_of(parting)) for parting in cause.partings]
     names = dict.fromkeys(name for query in document["queries"] for name in query["seen"])
     html = fill(
         "cause.html.j2",
         SCRIPTS,
         STYLES,
         cause=cause,
+        pairs=[(parting, images) for parting, images in pairs if images],
         commands=commands(run, cause),
         document=Markup(as_json(document)),
         renderers=[name for name in names if name != rollout.renderer],
@@ -333,16 +147,16 @@ def _drive(cause: Cause, log: RolloutLog, place: Place) -> JsonObject:
     """Return what the page draws of the motion: the drive from above, the curves of the seconds
     before the failure, and the span of time that they have in common.
     """
-    shown = shown_plans(log, cause.failed_us)
+    plans = shown_plans(log, cause.failed_us)
     size = [round(100 * side) for side in (log.ego_box.length_m, log.ego_box.width_m)]
     moments = []
     if cause.failed_us is not None:
         is_contact = cause.failure is not None and cause.failure.contact is not None
         kind = "collision" if is_contact else "event"
         moments = [{"t": place.ms([cause.failed_us])[0], "kind": kind, "text": cause.outcome}]
-    curves = curve_data(cause.failure, place)
+    curves = curve_data(cause, place)
     ends = [t for curve in curves for line in curve["lines"] for t in line["t"]]
-    ends += place.ms([plan.now_us for plan in shown]) or place.ms(log.ego.t_us[[0, -1]])
+    ends += place.ms([plan.now_us for plan in plans]) or place.ms(log.ego.t_us[[0, -1]])
     return {
         "drive": {
             "renderer": cause.rollout.renderer,
@@ -351,7 +165,7 @@ def _drive(cause: Cause, log: RolloutLog, place: Place) -> JsonObject:
             "users": list(range(len(log.actors))),
             "plans": [
                 {"t": place.ms([plan.now_us])[0], "lines": plan_lines(plan, place)}
-                for plan in shown
+                for plan in plans
             ],
             "moments": moments,
         },
@@ -360,14 +174,11 @@ def _drive(cause: Cause, log: RolloutLog, place: Place) -> JsonObject:
     }
 
 
-def curve_data(failure: Failure | None, place: Place) -> list[JsonObject]:
+def curve_data(cause: Cause, place: Place) -> list[JsonObject]:
     """Return speed, gap and lateral offset in the seconds before a failure, each with its lines: t
-    in milliseconds, v with nulls where there is no value.
-
-    Args:
-        failure: The measured failure; None where nothing could be measured.
-        place: Where times count from.
+    in milliseconds, v with nulls where there is no value; nothing where nothing was measured.
     """
+    failure = cause.failure
     approach = None if failure is None else failure.approach
     if failure is None or approach is None:
         return []
@@ -383,11 +194,8 @@ def curve_data(failure: Failure | None, place: Place) -> list[JsonObject]:
         posted = np.full(len(approach.t_us), approach.limit_mps)
         speed_lines.append(line("posted, at the last place", "posted", posted))
     curves = [("Speed", "m/s", speed_lines)]
-    actor_id = failure.nearest_id
-    if actor_id is not None:
-        gaps = gap_series(failure.log, approach.t_us, actor_id)
-        name = f"to {kind_of(failure.log.actors[actor_id])} {actor_id}"
-        curves.append(("Gap", "m", [line(name, "ego", gaps)]))
+    if failure.gap_m is not None:
+        curves.append(("Gap", "m", [line(f"to {failure.nearest}", "ego", failure.gap_m)]))
     offset = line("of the recorded path, left is above", "ego", approach.lateral_m)
     curves.append(("Lateral offset", "m", [offset]))
     return [
@@ -426,14 +234,14 @@ def with_units(rows: Sequence[Sequence[str]]) -> list[list[str]]:
         >>> with_units([["mode", "lane"], ["gap_m", "3.2"], ["score", "0.7"]])
         [['mode', 'lane'], ['gap_m', '3.2 m']]
     """
-    shown = []
+    texts = []
     for name, text in rows:
         unit = next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
         if not _is_number(text):
-            shown.append([name, text])
+            texts.append([name, text])
         elif unit:
-            shown.append([name, f"{text} {unit}"])
-    return shown
+            texts.append([name, f"{text} {unit}"])
+    return texts
 
 
 def _is_number(text: str) -> bool:
@@ -522,31 +330,14 @@ def _in_world(T_world_rig: F64, xy: F64, place: Place) -> list[list[int]]:
     return place.cm(transform_points(T_world_rig, rig)[:, :2])
 
 
-def _parting_of(run: Run, rollout: Rollout, entry: JsonView, start_us: int) -> Parting:
-    """Return where plans part by an entry of ``flips.json``; a policy sees the same images."""
-    at_s = (int(entry["t_us"]) - start_us) * 1e-6
-    gap_m = float(entry["gap_m"])
-    if entry["baseline"] == rollout.renderer:
-        name = str(entry["against"]).removeprefix(rollout.renderer + "/")
-        return Parting(name, "policy", at_s, gap_m)
-    paths = [inside(run.folder, name) for name in (entry.get("frames") or {}).values()]
-    images = [decode_image(read_bytes(path), str(path)) for path in paths if path is not None]
+def _images_of(parting: Parting) -> list[str]:
+    """Return the two images where plans part, JPEG in base64; nothing where there are not two of
+    one size.
+    """
+    images = [decode_image(read_bytes(path), str(path)) for path in parting.images]
     if len(images) != 2 or images[0].shape != images[1].shape:
-        images = []
-    encoded = [jpeg(smaller(image, WIDTH_PX)) for image in images]
-    return Parting(str(entry["baseline"]), "renderer", at_s, gap_m, encoded)
-
-
-def behind_others(run: Run, rollout: Rollout) -> list[str]:
-    """Say behind which renderers of the run the same rollout ends without an event."""
-    better = [
-        other.renderer
-        for other in run.rollouts
-        if other.ok and other.cell[1:] == rollout.cell[1:] and not outcomes_of(other)
-    ]
-    if not better or not outcomes_of(rollout):
         return []
-    return [f"Behind {' and '.join(better)} the same rollout ends without an event."]
+    return [jpeg(smaller(image, WIDTH_PX)) for image in images]
 
 
 FORK_S = 3.0  # before a failure, where no plans part: a fork at the failure repeats it

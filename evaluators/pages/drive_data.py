@@ -18,9 +18,10 @@ from alpasim_plugin.core.types import F64, I64, Actor, LoggedPlan, RolloutLog, T
 from alpasim_plugin.log.run_folder.records import Contact
 from alpasim_plugin.log.run_folder.rows import Rollout, series_by_rollout
 from evaluators.pages.birdseye import chord_angle, drawn_map
-from evaluators.pages.images import Rows, seen_before
+from evaluators.pages.images import Rows
 from evaluators.pages.rollouts import SERIES, events_of
 from evaluators.statistics.opening import Run
+from evaluators.statistics.sentences import seen_before
 
 METRIC_DIGITS = 5
 PLAN_STEP_US = 500_000

@@ -13,8 +13,6 @@ import cv2
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import (
-    GUESSED_SHARE,
-    RECORDED_SHARE,
     TRUST_CELLS,
     U8,
     LoggedImage,
@@ -29,7 +27,6 @@ from evaluators.statistics.opening import Run
 
 JPEG_QUALITY = 76
 FRAME_PX = 512  # wider frames are made smaller
-BEFORE_US = 1_000_000  # of an event: the images that led to it
 NO_FRAMES = "No camera frames were kept: the policy takes none, or the run had --images none. Run it again with --video all."
 
 
@@ -133,25 +130,3 @@ def trust_by_time(rows: Rows, camera: str) -> dict[int, str]:
         for row in rows
         if row.get("camera") == camera and TRUST_CELLS in row
     }
-
-
-def seen_before(rows: Rows, t_us: int) -> str:
-    """Say how much of the images in the second before an instant was guessed and recorded; empty
-    where no fixer says so.
-
-    Example:
-        >>> seen_before([{"t_us": 0, "guessed_share": 0.1, "recorded_share": 0.5}], 300_000)
-        '10 % of what it saw in the second before was made up by the fixer, 50 % was recorded'
-    """
-    near = [
-        row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us
-    ]
-    if not near:
-        return ""
-    guessed, recorded = (
-        sum(float(row[name]) for row in near) / len(near)
-        for name in (GUESSED_SHARE, RECORDED_SHARE)
-    )
-    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace(
-        "%", " %"
-    )

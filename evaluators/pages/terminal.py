@@ -13,6 +13,7 @@ from rich.text import Text
 from alpasim_plugin.core.escape import terminal as escape
 from alpasim_plugin.log.run_folder.schema import cell_name
 from evaluators.metrics import METRICS, MetricTable
+from evaluators.metrics.outcomes import worst_of
 from evaluators.metrics.presets import contact_note
 from evaluators.metrics.score_table import SCORES
 from evaluators.pages.overview import TONES, Overview
@@ -20,7 +21,6 @@ from evaluators.pages.tables import metric_rows
 from evaluators.results import Summary
 from evaluators.statistics.numbers import labelled
 from evaluators.statistics.opening import Run
-from evaluators.statistics.outcomes import worst_of
 
 STYLES = {"worse": "red", "better": "green", "mixed": "yellow", "unclear": "yellow", "neutral": ""}
 MOST_NAMED = 6  # variants whose failures are named

@@ -51,10 +51,13 @@ def common_to_failures(run: Run, rollout: Rollout) -> list[Common]:
     passed = [other for other in others if not outcomes_of(other)]
     if rollout not in failed:
         return []
-    found = [_by_surroundings(run, rollout, failed, passed, key) for key in ("time", "weather")]
-    found.append(_by_side(run, rollout, failed))
+    candidates = [
+        _by_surroundings(run, rollout, failed, passed, key) for key in ("time", "weather")
+    ]
+    candidates.append(_by_side(run, rollout, failed))
     return sorted(
-        (common for common in found if common is not None), key=lambda common: not common.decisive
+        (common for common in candidates if common is not None),
+        key=lambda common: not common.decisive,
     )
 
 
@@ -143,12 +146,12 @@ def _side_and_bend(run: Run, rollout: Rollout) -> tuple[str, str] | None:
     if failure is None or path is None:
         return None
     rows = run.steps_of(rollout).to_pylist()
-    aside = [
+    offsets = [
         (row["t_us"], row["value"]) for row in rows if row["metric"] == SIDE_METRIC and row["valid"]
     ]
-    if not aside:
+    if not offsets:
         return None
-    left_m = min(aside, key=lambda row: abs(row[0] - failure.t_us))[1]
+    left_m = min(offsets, key=lambda row: abs(row[0] - failure.t_us))[1]
     if abs(left_m) < ASIDE_M:
         return None
     away_m = np.hypot(*(path - [failure.x_m, failure.y_m]).T)

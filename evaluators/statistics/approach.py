@@ -188,7 +188,7 @@ def neighbour_at(log: RolloutLog, t_us: int, ids: Sequence[str] = ()) -> Neighbo
     """
     pose = interpolate(log.ego, t_us)
     yaw = float(heading_of(pose[:2, 0]))
-    own = _shape(pose[:2, 3], yaw, (log.ego_box.length_m, log.ego_box.width_m))
+    ego_shape = _shape(pose[:2, 3], yaw, (log.ego_box.length_m, log.ego_box.width_m))
     nearest: Neighbour | None = None
     for actor_id, actor in log.actors.items():
         track = actor.track
@@ -202,7 +202,7 @@ def neighbour_at(log: RolloutLog, t_us: int, ids: Sequence[str] = ()) -> Neighbo
             continue
         other_yaw = float(heading_of(other[:2, 0]))
         shape = _shape(other[:2, 3], other_yaw, (actor.box.length_m, actor.box.width_m))
-        gap_m = float(shapely.distance(own, shape))
+        gap_m = float(shapely.distance(ego_shape, shape))
         beside_m = (log.ego_box.width_m + actor.box.width_m) / 2 + 0.5
         towards = abs(float(wrap_angle(other_yaw - yaw))) > np.pi / 2
         if nearest is None or gap_m < nearest.gap_m:
@@ -223,17 +223,17 @@ def gap_series(log: RolloutLog, t_us: I64, actor_id: str) -> F64:
     """
     gaps = np.full(len(t_us), np.nan)
     actor = log.actors[actor_id]
-    there = (t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1])
-    if not there.any():
+    is_present = (t_us >= actor.track.t_us[0]) & (t_us <= actor.track.t_us[-1])
+    if not is_present.any():
         return gaps
-    ego = interpolate(log.ego, t_us[there])
-    other = interpolate(actor.track, t_us[there])
+    ego = interpolate(log.ego, t_us[is_present])
+    other = interpolate(actor.track, t_us[is_present])
     shapes = []
     for poses, box in ((ego, log.ego_box), (other, actor.box)):
         size = np.broadcast_to([box.length_m, box.width_m], (len(poses), 2))
         corners = rectangle_corners(poses[:, :2, 3], heading_of(poses[:, :2, 0]), size)
         shapes.append(shapely.polygons(corners))
-    gaps[there] = shapely.distance(*shapes)
+    gaps[is_present] = shapely.distance(*shapes)
     return gaps
 
 

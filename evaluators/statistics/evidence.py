@@ -4,7 +4,7 @@ that place, comes first.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -37,6 +37,7 @@ from evaluators.statistics.approach import (
     Approach,
     Neighbour,
     approach_of,
+    gap_series,
     needed_mps2,
     neighbour_at,
     turns_of,
@@ -74,6 +75,8 @@ class Failure:
         contact: What it failed with, as `contact_of_failure` gives it; None where that is no
             contact.
         approach: The seconds before; None where nothing could be measured.
+        nearest: Who was touched, or else is the nearest one ahead at the failure: kind and id.
+        gap_m: ``(T,)`` to that one at the steps of the approach, NaN where it is not there.
     """
 
     log: RolloutLog
@@ -81,6 +84,8 @@ class Failure:
     outcomes: frozenset[str]
     contact: Contact | None
     approach: Approach | None
+    nearest: str = ""
+    gap_m: F64 | None = None
 
     @classmethod
     def of(
@@ -100,7 +105,16 @@ class Failure:
         """
         if contact is not None:
             failed_us = contact_us(log, contact)
-        return cls(log, failed_us, outcomes, contact, approach_of(log, failed_us, content))
+        approach = approach_of(log, failed_us, content)
+        failure = cls(log, failed_us, outcomes, contact, approach)
+        ahead = neighbour_at(log, failed_us)
+        actor = None if ahead is None else ahead.actor
+        if contact is not None:
+            actor = log.actors[contact.actor_id]
+        if approach is None or actor is None:
+            return failure
+        gap_m = gap_series(log, approach.t_us, actor.actor_id)
+        return replace(failure, nearest=f"{kind_of(actor)} {actor.actor_id}", gap_m=gap_m)
 
     @property
     def plans(self) -> list[LoggedPlan]:
@@ -116,14 +130,6 @@ class Failure:
     def is_slow(self) -> bool:
         """Tell whether it failed because it was slow, or ended short."""
         return not self.outcomes or bool(self.outcomes & SLOW_OUTCOMES)
-
-    @property
-    def nearest_id(self) -> str | None:
-        """Give the road user that was touched, or else the nearest one ahead at the failure."""
-        if self.contact is not None:
-            return self.contact.actor_id
-        ahead = neighbour_at(self.log, self.failed_us)
-        return None if ahead is None else ahead.actor.actor_id
 
     def before_s(self, plan: LoggedPlan) -> float:
         """Return how long before the failure a plan was asked for, seconds."""
@@ -298,16 +304,16 @@ def _in_rig(log: RolloutLog, plan: LoggedPlan) -> F64:
     return transform_points(inverse(rig), plan.trajectory.xyz)
 
 
-def _is_same(log: RolloutLog, one: LoggedPlan, other: LoggedPlan) -> bool:
-    points, others = _in_rig(log, one), _in_rig(log, other)
+def _is_same(log: RolloutLog, plan: LoggedPlan, other: LoggedPlan) -> bool:
+    points, others = _in_rig(log, plan), _in_rig(log, other)
     return points.shape == others.shape and bool(np.abs(points - others).max() < SAME_PLAN_M)
 
 
-def _route_moved_m(one: LoggedPlan, other: LoggedPlan) -> float:
+def _route_moved_m(plan: LoggedPlan, other: LoggedPlan) -> float:
     """Return how far to the side the route ahead has moved between two queries."""
-    if one.route.shape != other.route.shape or len(one.route) < NEAR_POINTS.stop:
+    if plan.route.shape != other.route.shape or len(plan.route) < NEAR_POINTS.stop:
         return 0.0
-    moved = np.abs(one.route[NEAR_POINTS, 1] - other.route[NEAR_POINTS, 1])
+    moved = np.abs(plan.route[NEAR_POINTS, 1] - other.route[NEAR_POINTS, 1])
     return float(np.max(moved[np.isfinite(moved)], initial=0.0))
 
 

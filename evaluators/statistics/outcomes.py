@@ -11,7 +11,6 @@ from evaluators.metrics.outcomes import (
     ENDINGS,
     OUTCOMES,
     ending_of,
-    gravity,
     has_ended,
     outcome_events,
     outcomes_of,
@@ -33,14 +32,6 @@ def times_of(manifests: Iterable[Manifest]) -> Times:
         manifest.path: {name: event.t_s for name, event in outcome_events(manifest.events).items()}
         for manifest in manifests
     }
-
-
-def worst_of(rollouts: Iterable[Rollout]) -> Rollout | None:
-    """Return the rollout that failed worst: one that broke off, then the gravest outcome, then the
-    first; None where none failed.
-    """
-    failed = [rollout for rollout in rollouts if not rollout.ok or outcomes_of(rollout)]
-    return min(failed, key=lambda rollout: gravity(rollout) if rollout.ok else -1, default=None)
 
 
 def outcome_table(rollouts: Sequence[Rollout], times: Times | None = None) -> dict[str, Endings]:

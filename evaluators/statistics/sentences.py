@@ -3,11 +3,12 @@ report and the terminal.
 """
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.json_types import JsonView
-from alpasim_plugin.core.types import MetricInfo
+from alpasim_plugin.core.types import GUESSED_SHARE, RECORDED_SHARE, MetricInfo
 from evaluators.results import Difference, to_json
 from evaluators.statistics.intervals import FEW_SCENES, LEAST_SCENES
 from evaluators.statistics.numbers import (
@@ -234,3 +235,28 @@ def _seeds_text(seeds: int | None) -> str:
 
 def _place(pair: JsonView) -> str:
     return f"{pair['scene']} seed {pair['seed']}"
+
+
+BEFORE_US = 1_000_000  # of an event: the images that led to it
+
+
+def seen_before(rows: Sequence[Mapping[str, Any]], t_us: int) -> str:
+    """Say how much of the images in the second before an instant was guessed and recorded; empty
+    where no fixer says so.
+
+    Example:
+        >>> seen_before([{"t_us": 0, "guessed_share": 0.1, "recorded_share": 0.5}], 300_000)
+        '10 % of what it saw in the second before was made up by the fixer, 50 % was recorded'
+    """
+    near = [
+        row for row in rows if GUESSED_SHARE in row and t_us - BEFORE_US <= int(row["t_us"]) <= t_us
+    ]
+    if not near:
+        return ""
+    guessed, recorded = (
+        sum(float(row[name]) for row in near) / len(near)
+        for name in (GUESSED_SHARE, RECORDED_SHARE)
+    )
+    return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace(
+        "%", " %"
+    )

@@ -15,7 +15,8 @@ from alpasim_plugin.fixers.trust import (
     trust_facts,
     trust_sums,
 )
-from evaluators.pages.images import seen_before, trust_by_time
+from evaluators.pages.images import trust_by_time
+from evaluators.statistics.sentences import seen_before
 
 
 def trust(output, render, recorded):

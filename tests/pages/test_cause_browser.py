@@ -4,7 +4,9 @@ import dataclasses
 
 import pytest
 
-from evaluators.pages.cause import cause_of, worst_failure, write_cause
+from alpasim_plugin.runs.reports import failure_cause
+from evaluators.pages.cause import write_cause
+from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import read_run
 from tests.pages.browser import Browser, find_chromium
 from tests.pages.make_run import Plan
@@ -27,7 +29,7 @@ def page_of(folder, cameras):
     plan = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0, 1), steps=24)
     plan = dataclasses.replace(plan, harm={"clean": 6.0, "3dgs": 6.0})
     run = read_run(make_watched(folder, plan, cameras=cameras))
-    return write_cause(run, cause_of(run, worst_failure(run), []))
+    return write_cause(run, failure_cause(run, worst_failure(run)))
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -3,9 +3,9 @@
 import pytest
 
 from alpasim_plugin.runs.plan import RunOptions, make_plan
-from alpasim_plugin.runs.reports import divergences_of
+from alpasim_plugin.runs.reports import failure_cause
 from alpasim_plugin.runs.run import execute_run
-from evaluators.pages.cause import cause_of, worst_failure
+from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import Run, read_run
 from scenarios.suite import expand
 from tests.pages.cause_policies import SCENES, TWENTY
@@ -43,7 +43,7 @@ def sentences_of(run: Run, fault) -> list[str]:
     """Return what the page of the worst failure of a policy says."""
     rollouts = [rollout for rollout in run.rollouts if rollout.policy == fault.name]
     worst = worst_failure(run, rollouts)
-    return list(cause_of(run, worst, divergences_of(run, worst)).sentences)
+    return list(failure_cause(run, worst).sentences)
 
 
 @pytest.mark.slow

@@ -3,8 +3,8 @@
 import dataclasses
 
 from evaluators.metrics.outcomes import outcomes_of
-from evaluators.pages.cause import worst_failure
 from evaluators.pages.terminal import next_command
+from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import read_run
 from tests.docs.parsed_commands import parse
 from tests.pages.make_run import Plan, make_run

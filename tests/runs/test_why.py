@@ -14,10 +14,9 @@ from alpasim_plugin.core import parts
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import Plan, SensorSpec
 from alpasim_plugin.runs.plan import RunOptions, make_plan
-from alpasim_plugin.runs.reports import divergences_of
+from alpasim_plugin.runs.reports import failure_cause
 from alpasim_plugin.runs.run import execute_run
 from evaluators.metrics.outcomes import SHORT_OF_END
-from evaluators.pages.cause import cause_of
 from evaluators.statistics.opening import read_run
 from scenarios.suite import expand
 from tests.runs.faulty_policies import CAUSES, FAULTS
@@ -218,7 +217,7 @@ def test_no_page_names_a_false_cause_and_most_show_the_right_evidence_first(
         execute_run(plan, folder, 1, ["simrun"], Announced())
         read = read_run(folder)
         for one in read.rollouts:
-            sentences = cause_of(read, one, divergences_of(read, one)).sentences
+            sentences = failure_cause(read, one).sentences
             word = names[one.policy]
             if not sentences or word not in sentences[0]:
                 missed.append((one.policy, sentences[:2]))
