@@ -4,7 +4,7 @@ and a scenario that says nothing.
 A policy may return anything; nothing here assumes more than an object.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from alpasim_plugin.core.types import (
 REACH_M = 20_000.0  # of a plan, from where it is made
 LONGEST_S = 600.0  # of a plan; what is longer counts in nanoseconds
 MOST_SAMPLES = 1000  # of a plan: a log holds each at every query
+MOST_POSES = 100_000  # of a plan and its samples together, for the same reason
 STALE_S = 10.0  # between now and the first pose that somebody else's clock gave a plan
 ARRAYS = ("times_us", "xy", "yaw")
 UNITS = (
@@ -91,6 +92,9 @@ def shape_problem(plan: Any, min_rows: int = 1) -> str:
     far_m = float(np.abs(plan.xy).max(initial=0.0))
     if far_m > REACH_M:
         return f"the plan reaches {far_m:.3g} m, farther than the {REACH_M:g} m of the longest road"
+    debug = getattr(plan, "debug", {})
+    if not isinstance(debug, Mapping):
+        return f"debug is {_a(debug)}, not a dictionary"
     return _samples_problem(getattr(plan, "samples", ()), n)
 
 
@@ -100,6 +104,9 @@ def _samples_problem(samples: Any, n: int) -> str:
         return f"samples is {_a(samples)}, not a tuple of arrays"
     if len(samples) > MOST_SAMPLES:
         return f"the plan has {len(samples):,} sampled alternatives; {MOST_SAMPLES:,} are the most that a log takes"
+    if n * (1 + len(samples)) > MOST_POSES:
+        beside = f", {len(samples):,} sampled alternatives included" if samples else ""
+        return f"the plan has {n * (1 + len(samples)):,} poses{beside}; {MOST_POSES:,} are the most that a log takes"
     for sample in samples:
         if not isinstance(sample, np.ndarray) or sample.dtype.kind not in "iuf":
             return f"a sampled alternative is {_a(sample)}, not an array of numbers"

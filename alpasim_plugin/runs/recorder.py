@@ -40,7 +40,7 @@ from alpasim_plugin.log import (
     read_asl,
     write_facts,
 )
-from alpasim_plugin.log.debug import debug_row
+from alpasim_plugin.log.debug import FULL, MOST_BYTES, debug_row, size_of
 from alpasim_plugin.log.run_folder.schema import (
     DEBUG_NAME,
     FRAMES_NAME,
@@ -125,6 +125,7 @@ class Recorder:
         self._times = StageTimes()
         self._frames: list[JsonObject] = []
         self._debug: list[JsonObject] = []
+        self._debug_bytes = 0
         self.film = Film()
         self._last_query_us = -1
         self._steps = 0
@@ -219,8 +220,12 @@ class Recorder:
         """Log the policy's plan and its samples, in world coordinates, and what it says of them."""
         with self.stage("log"):
             self._log.driver_return(plan, samples)
-            if debug:
-                self._debug.append({"t_us": int(plan.t_us[0]), **debug_row(debug)})
+            if debug and self._debug_bytes < MOST_BYTES:
+                row = debug_row(debug)
+                self._debug_bytes += size_of(row)
+                if self._debug_bytes >= MOST_BYTES:
+                    row = debug_row({"debug": FULL})
+                self._debug.append({"t_us": int(plan.t_us[0]), **row})
 
     def control_step(
         self, before: EgoState, plan: Trajectory | None, after: EgoState, forced: bool

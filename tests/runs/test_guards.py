@@ -1,5 +1,6 @@
 """What a renderer or a policy returns against its contract is that part's failure."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,10 @@ from alpasim_plugin.core.errors import PolicyError, RendererError
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.plan_check import clock_problem, plan_problem
 from alpasim_plugin.core.types import Frame, Plan
+from alpasim_plugin.log.debug import FULL
+from alpasim_plugin.log.run_folder.schema import DEBUG_NAME
 from alpasim_plugin.renderers import make_renderer
+from alpasim_plugin.runs import recorder
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.guards import checked_frames
 from alpasim_plugin.runs.rollout import run_rollout
@@ -81,6 +85,21 @@ def test_a_plan_that_no_road_is_long_enough_for_is_the_policys_failure():
     assert "1,001 sampled alternatives" in problem
 
 
+@pytest.mark.parametrize(("samples", "poses"), [(0, 200_000), (999, 101)])
+def test_a_plan_of_too_many_poses_is_refused(samples, poses):
+    times = 1000 * np.arange(poses)
+    alternatives = (np.zeros((poses, 3)),) * samples
+    plan = Plan(0, times, np.zeros((poses, 2)), np.zeros(poses), alternatives)
+    problem = plan_problem(plan, 0)
+    assert f"{poses * (1 + samples):,} poses" in problem
+    assert "100,000 are the most" in problem
+
+
+def test_a_plan_whose_debug_is_no_dictionary_is_refused():
+    plan = Plan(0, np.arange(4), np.zeros((4, 2)), np.zeros(4), debug=["nearest", 3])
+    assert "debug is a list" in plan_problem(plan, 0)
+
+
 NOW_US = 1_700_000_000_000_000
 AHEAD_US = np.arange(0, 5_000_001, 500_000)
 
@@ -106,3 +125,16 @@ def test_a_plan_that_counts_in_nanoseconds_is_the_policys_failure():
     times_us = NOW_US + 1000 * AHEAD_US
     plan = Plan(NOW_US, times_us, np.zeros((len(times_us), 2)), np.zeros(len(times_us)))
     assert "not in microseconds" in plan_problem(plan, NOW_US)
+
+
+class Talks(ConstantVelocity):
+    def act(self, observation):
+        return replace(super().act(observation), debug={"boxes": np.ones((1000, 4))})
+
+
+def test_what_a_policy_says_of_itself_has_a_budget_in_a_rollout(monkeypatch):
+    monkeypatch.setattr(recorder, "MOST_BYTES", 50_000)
+    done = run_rollout(SCENE, make_renderer("clean", SCENE), Talks(SCENE))
+    rows = [json.loads(line) for line in (done.folder / DEBUG_NAME).read_text().splitlines()]
+    assert [bool(row["boxes"]) for row in rows] == [True, False]
+    assert rows[-1]["text"] == [["debug", FULL]]
