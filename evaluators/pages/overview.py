@@ -134,14 +134,24 @@ class VariantRow:
         return sum(n for name, n in self.endings.items() if name not in UNHARMED)
 
     @property
+    def n_lost(self) -> int:
+        """Count those of them that could not be run: nothing is known of how they would have ended."""
+        return self.endings.get(NOT_RUN, 0)
+
+    @property
+    def share(self) -> str:
+        """Say in how many of the rollouts that ran it failed; empty where it is none."""
+        n_bad = self.n_failed - self.n_lost
+        return f"in {n_bad} of {plural(self.n_rollouts - self.n_lost, 'rollout')}" if n_bad else ""
+
+    @property
     def where(self) -> str:
         """Give its first failures in words."""
         texts = []
         for ending, cells in self.places.items():
             more = f" and {len(cells) - PLACES} more" if len(cells) > PLACES else ""
             texts.append(f"{ending} in {', '.join(cells[:PLACES])}{more}")
-        lost = self.endings.get(NOT_RUN)
-        return "; ".join([*texts, *([f"{lost} not run"] if lost else [])])
+        return "; ".join([*texts, *([f"{self.n_lost} not run"] if self.n_lost else [])])
 
 
 @dataclass(frozen=True)
@@ -180,8 +190,11 @@ class Overview:
         n = len(self.failing)
         total = plural(len(self.rows), "variant")
         if len(self.rows) == 1:
-            n = self.rows[0].n_failed
+            (row,) = self.rows
             total = plural(n_rollouts, "rollout")
+            n = row.n_failed - row.n_lost
+            if row.n_lost and not n:
+                return f"{row.n_lost} of {total} could not be run", "worse"
         tone: Tone = "worse" if n else "unclear" if n_short else "better"
         text = f"{n} of {total} fail{'s' if n == 1 else ''}" if n else f"no failure in {total}"
         return text, tone
@@ -208,8 +221,9 @@ class Overview:
             return f"{reached} of {plural(n, 'rollout')} reach the end, and none fails"
         worst = self.failing[0]
         most = "" if len(self.failing) == 1 else "most, "
-        share = f"in {worst.n_failed} of {plural(worst.n_rollouts, 'rollout')}"
-        return f"{worst.name} fails {most}{share}: {worst.where}"
+        if not worst.share:
+            return f"{worst.name}: {worst.n_lost} of {plural(worst.n_rollouts, 'rollout')} not run"
+        return f"{worst.name} fails {most}{worst.share}: {worst.where}"
 
     @property
     def endings(self) -> list[tuple[str, tuple[str, ...]]]:

@@ -68,6 +68,30 @@ def test_every_rollout_is_counted_once_under_its_variant(usual_run):
     assert all(row.where.endswith("not run") for row in shown.rows if row.endings.get("not run"))
 
 
+def test_what_could_not_be_run_is_no_failure_of_the_driving(tmp_path):
+    harm = {"clean": 0.15, "3dgs": 8.0}
+    for renderers in (("clean", "3dgs"), ("3dgs",)):
+        for fail in ((), (("3dgs", "scene-1", 0),)):
+            scenes = tuple(f"scene-{k}" for k in range(5))
+            plan = Plan(renderers, scenes=scenes, seeds=(0,), steps=30, clips=False,
+                        harm=harm, fail=fail)  # fmt: skip
+            folder = tmp_path / f"{len(renderers)}-{len(fail)}"
+            shown = overview_of(read_run(make_run(folder, plan)))
+            row = next(row for row in shown.rows if row.renderer == "3dgs")
+            counts = shown.counts.replace("\u00a0", " ")
+            n_bad = int(re.search(r"(\d+) fail", counts).group(1))
+            assert row.n_lost == len(fail)
+            assert f"fails in {n_bad} of {5 - len(fail)} rollouts" in shown.title.replace(
+                "\u00a0", " "
+            )
+            if len(renderers) == 1:
+                assert shown.badge[0].startswith(f"{n_bad} of 5")
+    lost = dataclasses.replace(row, endings={"not run": 2, "reached the end": 3}, places={})
+    only = dataclasses.replace(shown, rows=(lost,))
+    assert only.badge[0].replace("\u00a0", " ") == "2 of 5 rollouts could not be run"
+    assert only.title.replace("\u00a0", " ") == "3dgs: 2 of 5 rollouts not run"
+
+
 def test_terminal_markdown_and_page_print_the_same_cells(three):
     shown = overview_of(read_run(three))
     terminal = "\n".join(line.plain for line in overview_lines(shown, 100))
