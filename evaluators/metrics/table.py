@@ -353,8 +353,7 @@ METRICS = MetricTable(
             event="left_route",
             reference=CENTRE,
             invalid=_SHORT,
-            formula="distance from `c` to `P` with both ends going straight on (in the direction of their last metre; what `P` does within "
-            "0.5 m of an end is standing): driving past the end is no distance",
+            formula="[distance to the side](metrics.md#lateral-distance) from `c` to `P`, which goes straight on beyond its ends",
         ),
         "route_distance_m": _metres(
             "the paper's: mean distance from the recorded path; driving past its end counts as distance",

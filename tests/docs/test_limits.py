@@ -1,0 +1,26 @@
+"""The limits of a server that the page of security names are those of the code."""
+
+import re
+
+from alpasim_plugin.alpasim.server import hosting, lens_cache, views
+
+
+def test_the_table_of_a_server_s_limits_is_that_of_the_code(repo):
+    page = (repo / "docs" / "security.md").read_text()
+    section = page.partition("## What a server promises")[2].partition("\n## ")[0]
+    values = {
+        name: [float(number.replace(",", "")) for number in re.findall(r"\d[\d,]*\.?\d*", value)]
+        for name, value in re.findall(r"^\| ([^|]+?) \| ([^|]+?) \|", section, re.M)
+    }
+    assert values["calls that wait, in all"] == [hosting.CALLS]
+    assert values["calls on one connection"] == [hosting.STREAMS]
+    assert values["sessions at a time"] == [hosting.SESSIONS]
+    assert values["a handshake"] == [hosting.HANDSHAKE_S]
+    assert values["messages that are received at a time"] == [hosting.RECEIVING]
+    assert values["the time that a caller has to send one"] == [hosting.SENDING_S]
+    assert values["pixels of a frame"] == [
+        views.MAX_SIDE_PX,
+        views.MAX_SIDE_PX,
+        round(views.MAX_PIXELS / 1e6, 1),
+    ]
+    assert values["memory for lenses that callers name"] == [lens_cache.LENS_BYTES / 2**20]
