@@ -34,14 +34,33 @@ if (location.protocol === "file:") window.Worker = class extends EventTarget {
 </script>"""
 
 
+# Pages that lie in the root of the repository -> their place on the site.
+ROOT_PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+
+
+def on_files(files: Any, config: Any, **_: Any) -> Any:
+    """Add the pages of the repository's root to those of the site."""
+    from mkdocs.structure.files import File
+
+    for name, page in ROOT_PAGES.items():
+        content = (REPO / name).read_text(encoding="utf-8").replace("](docs/", "](")
+        files.append(File.generated(config, page, content=content.replace("](LICENSE)", "](#licence)")))
+    return files
+
+
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Return the text of a page: of the home page that of the README, its links from ``docs/``,
     followed by the list of all pages.
     """
+    for name, root_page in ROOT_PAGES.items():
+        markdown = markdown.replace(f"](../{name}", f"]({root_page}")
     if page.file.src_uri != "index.md":
         return markdown.replace("](../README.md", "](index.md")
     readme = (REPO / "README.md").read_text(encoding="utf-8")
     home = readme.replace("](docs/index.md", "](#pages").replace("](docs/", "](")
+    home = home.replace("](CONTRIBUTING.md", "](contributing.md").replace(
+        "](CHANGELOG.md", "](changelog.md"
+    )
     pages = markdown.replace("# Pages\n", "## Pages\n", 1).replace("](../README.md", "](index.md")
     return f"{home}\n{pages}"
 

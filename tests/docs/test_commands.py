@@ -7,6 +7,7 @@ The second is slow: ``pytest -m slow`` on this file.
 import itertools
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from tests.docs.commands import (
     NOTHING_FITTED,
     OTHER,
     SHORT,
+    TUTORIALS,
     commands,
     lines_of,
     pages,
@@ -214,6 +216,24 @@ def test_the_command_works_from_an_empty_folder_with_the_wheel(simrun, empty, co
         else done.returncode == 0
     ), done.stderr[-3000:]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_every_step_of_the_tutorial_ends_as_it_says(simrun, tmp_path, page):
+    text = (REPO / page).read_text(encoding="utf-8")
+    for block in re.findall(r"^```yaml\n(# .*?)^```", text, re.S | re.M):
+        (tmp_path / block.split()[1]).write_text(block)
+    blocks = re.findall(r"^```bash\n(.*?)^```", text, re.S | re.M)
+    lines = [line for block in blocks for line in block.splitlines()]
+    assert len(lines) > 4
+    for line in lines:
+        command, *words = shlex.split(line, comments=True)
+        assert command == "simrun"
+        code = re.search(r"# exit code (\d)$", line)
+        done = call(simrun, tmp_path, words)
+        assert done.returncode == (int(code[1]) if code else 0), line + done.stderr[-3000:]
 
 
 def prepare(simrun, folder, words):
