@@ -44,7 +44,9 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
 
     for name, page in ROOT_PAGES.items():
         content = (REPO / name).read_text(encoding="utf-8").replace("](docs/", "](")
-        files.append(File.generated(config, page, content=content.replace("](LICENSE)", "](#licence)")))
+        files.append(
+            File.generated(config, page, content=content.replace("](LICENSE)", "](#licence)"))
+        )
     return files
 
 

@@ -19,7 +19,13 @@ import pytest
 from tests.docs.commands import SHORT, commands, pages
 
 REPO = Path(__file__).resolve().parents[2]
-PAGES = ("docs/alpasim.md", "docs/behind-alpasim.md", "docs/can.md", "docs/policies.md", "docs/renderers.md")
+PAGES = (
+    "docs/alpasim.md",
+    "docs/behind-alpasim.md",
+    "docs/can.md",
+    "docs/policies.md",
+    "docs/renderers.md",
+)
 # other pages' subjects
 ELSEWHERE = r"^(?!.*(127\.0\.0\.1:|can://|^serve)).*$|exec:"
 CLEAN = ("serve", "--renderer", "clean", "--scenes", "scenes", "--listen")
