@@ -233,7 +233,7 @@ class StraightInRain(Follower):
         return super().act(observation)
 
 
-LEAST_CONTRAST = 8.0
+LEAST_CONTRAST = 22.0
 
 
 class BrakesForOncoming(PurePursuit):
