@@ -59,6 +59,8 @@ ASIDE_M = 0.4  # from the recorded path: less is no evidence
 SWING_M = 0.25  # of an offset that swings to both sides
 SWINGS = 3
 SAME_PLAN_M = 0.01
+STRAIGHT_M = 0.1  # beside its chord
+HELD_S = 3.0  # before a failure: a plan that was held earlier has no part in it
 SAME_PLANS = 3  # queries in a row with one plan
 ROUTE_MOVED_M = 0.5  # by which the route near by has moved meanwhile in the rig frame
 NEAR_POINTS = slice(1, 4)  # of the route, 4 to 13 m ahead: what lies farther need not change a plan
@@ -286,16 +288,31 @@ def held_plan_fact(failure: Failure) -> str:
     for plan in plans:
         is_same = bool(streak) and _is_same(failure.log, streak[-1], plan)
         streak = [*streak, plan] if is_same else [plan]
-        if len(streak) > len(longest) and _route_moved_m(streak[0], plan) > ROUTE_MOVED_M:
+        if len(streak) > len(longest) and abs(_route_moved_m(streak[0], plan)) > ROUTE_MOVED_M:
             longest = streak
-    if len(longest) < SAME_PLANS:
+    if len(longest) < SAME_PLANS or failure.before_s(longest[-1]) > HELD_S:
         return ""
+    moved_m = _route_moved_m(longest[0], longest[-1])
+    queries = plural(len(longest), "query", "queries")
     until_s = failure.before_s(longest[-1])
     until = f", until {until_s:.1f} s before the failure" if until_s >= 0.15 else ""
+    if _is_straight(longest[-1]):
+        return (
+            f"Plans lead straight on in {queries} in a row, where the route turns "
+            f"{_side(moved_m)}{until}."
+        )
     return (
-        f"{plural(len(longest), 'query', 'queries')} in a row get the same plan, seen from the ego, "
-        f"while the route moves by {_route_moved_m(longest[0], longest[-1]):.1f} m{until}."
+        f"{queries} in a row get the same plan, seen from the ego, while the route moves by "
+        f"{abs(moved_m):.1f} m{until}."
     )
+
+
+def _is_straight(plan: LoggedPlan) -> bool:
+    """Tell whether a plan leads along a straight line."""
+    xy = plan.trajectory.xyz[:, :2]
+    chord = xy[-1] - xy[0]
+    length_m = float(np.hypot(*chord))
+    return length_m > 0.0 and bool(np.abs(cross(chord, xy - xy[0])).max() < STRAIGHT_M * length_m)
 
 
 def _in_rig(log: RolloutLog, plan: LoggedPlan) -> F64:
@@ -310,11 +327,12 @@ def _is_same(log: RolloutLog, plan: LoggedPlan, other: LoggedPlan) -> bool:
 
 
 def _route_moved_m(plan: LoggedPlan, other: LoggedPlan) -> float:
-    """Return how far to the side the route ahead has moved between two queries."""
+    """Return how far the route near by has moved to the left between two queries."""
     if plan.route.shape != other.route.shape or len(plan.route) < NEAR_POINTS.stop:
         return 0.0
-    moved = np.abs(plan.route[NEAR_POINTS, 1] - other.route[NEAR_POINTS, 1])
-    return float(np.max(moved[np.isfinite(moved)], initial=0.0))
+    moved = other.route[NEAR_POINTS, 1] - plan.route[NEAR_POINTS, 1]
+    moved = moved[np.isfinite(moved)]
+    return float(max(moved, key=abs, default=0.0))
 
 
 def slow_fact(failure: Failure) -> str:

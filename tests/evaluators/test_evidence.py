@@ -136,7 +136,16 @@ def test_one_plan_for_many_queries_counts_where_the_route_near_by_has_moved():
     ]
     assert not any("same plan" in text for text in facts_of(still))
     sentence = facts_of(replace(log, plans=tuple(moved)))[0].replace("\u00a0", " ")
+    assert sentence == "Plans lead straight on in 60 queries in a row, where the route turns left."
+    bent = [replace(plan, trajectory=bent_line(plan.trajectory)) for plan in moved]
+    sentence = facts_of(replace(log, plans=tuple(bent)))[0].replace("\u00a0", " ")
     assert sentence.startswith("60 queries in a row get the same plan, seen from the ego")
+
+
+def bent_line(line):
+    """Return a plan's line that bends to the left."""
+    x = line.xyz[:, 0] - line.xyz[0, 0]
+    return replace(line, xyz=line.xyz + np.column_stack([0 * x, 0.02 * x**2, 0 * x]))
 
 
 def test_the_nearest_ahead_and_the_turn_of_a_path():

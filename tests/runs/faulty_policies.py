@@ -261,7 +261,7 @@ FAULTS = {
         Centimetres: "centimetres",
         SwappedAxes: "in the rig frame x is forward",
         EmptyPlan: "(0, 2)",
-        ConstantPlan: "get the same plan",
+        ConstantPlan: "lead straight on",
         Jitter: "from query to query",
         StopsForever: "where the recording drives",
     },
