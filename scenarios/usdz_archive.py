@@ -15,7 +15,13 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.config import parse
 from alpasim_plugin.core.files.fields import field_name, met_in
-from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, SOURCE_BYTES, YAML_BYTES
+from alpasim_plugin.core.files.limits import (
+    ARCHIVE_BYTES,
+    JSON_BYTES,
+    SOURCE_BYTES,
+    YAML_BYTES,
+    Bound,
+)
 from alpasim_plugin.core.files.reading import check_names, open_regular
 from alpasim_plugin.core.files.tables import parse_parquet
 from alpasim_plugin.core.json_types import JsonObject
@@ -58,8 +64,12 @@ class Archive:
     def __contains__(self, member: str) -> bool:
         return member in self._infos
 
-    def read(self, member: str) -> bytes:
+    def read(self, member: str, bound: Bound = SOURCE_BYTES) -> bytes:
         """Read a member; its name and bytes enter the hash of `files`.
+
+        Args:
+            member: Its name.
+            bound: How many bytes it may have.
 
         Raises:
             InputError: It is missing, encrypted, damaged, or larger than the limit, whatever size
@@ -69,7 +79,7 @@ class Archive:
         info = self._infos.get(member)
         if info is None:
             raise InputError(f"{location}: no such member", "give a complete AlpaSim scene")
-        most = int(SOURCE_BYTES.high)
+        most = int(bound.high)
         if info.file_size > most:
             raise InputError(
                 f"{location}: {info.file_size} bytes", f"give a member below {most} bytes"
@@ -99,15 +109,14 @@ class Archive:
 
     def json(self, member: str) -> Any:
         """Read a JSON member."""
-        return parse_json(self.read(member), f"{self.path}, {member}")
+        return parse_json(self.read(member, JSON_BYTES), f"{self.path}, {member}")
 
     def yaml(self, member: str) -> Any:
         """Read a YAML member; only plain data is built, within the bounds of a configuration
         file.
         """
         location = f"{self.path}, {member}"
-        data = self.read(member)
-        YAML_BYTES.check(len(data), location)
+        data = self.read(member, YAML_BYTES)
         with parsing(location, "fetch the file again", "broken YAML"):
             return parse(data.decode("utf-8"), location).data
 

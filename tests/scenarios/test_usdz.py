@@ -178,12 +178,23 @@ def test_a_member_that_stands_twice_is_refused(tmp_path):
         read_usdz(path)
 
 
+@pytest.mark.parametrize(
+    ("member", "limit"),
+    [("metadata_dot_yaml", "YAML_BYTES"), ("rig_trajectories_dot_json", "JSON_BYTES")],
+)
+def test_a_member_that_is_parsed_has_the_limit_of_its_format(tmp_path, monkeypatch, member, limit):
+    small = replace(getattr(usdz_archive, limit), high=20_000)
+    monkeypatch.setattr(usdz_archive, limit, small)
+    read_usdz(write(tmp_path / "a.usdz"))
+    large = write(tmp_path / "b.usdz", changed(**{member: b" " * 20_001}))
+    with pytest.raises(InputError, match="20001 bytes"):
+        read_usdz(large)
+
+
 def test_a_member_that_swells_beyond_the_limit_is_refused(tmp_path, monkeypatch):
     path = write(tmp_path / "a.usdz", changed(rig_trajectories_dot_json=b" " * 300_000))
     assert path.stat().st_size < 20_000
-    monkeypatch.setattr(
-        usdz_archive, "SOURCE_BYTES", replace(usdz_archive.SOURCE_BYTES, high=100_000)
-    )
+    monkeypatch.setattr(usdz_archive, "JSON_BYTES", replace(usdz_archive.JSON_BYTES, high=100_000))
     with pytest.raises(InputError, match="300000 bytes"):
         read_usdz(path)
     data = bytearray(path.read_bytes())
