@@ -25,6 +25,7 @@ COMFORT_BRAKE_MPS2 = 2.0  # before a curve
 # Towards a limit of speed
 ACCEL_MPS2 = 1.5
 BRAKE_MPS2 = 4.0
+FAR_M = 10.0  # a route that begins farther ahead has no points nearer
 MIN_LOOKAHEAD_M = 3.0
 CUT_M = 0.15
 LOOKAHEAD_S = 0.7
@@ -124,9 +125,12 @@ def route_left(route_rig: F64) -> F64 | None:
     """Return the points ``(M, 2)`` of the route ``(20, 3)`` before its NaN rows; None where less
     than half a metre of it is left.
 
-    The route begins at the ego's projection, so the first point may lie beside the ego.
+    The route begins at the ego's projection, so the first point may lie beside the ego. Where its
+    points begin far ahead (``route.start_offset_m``), a straight line leads there from the ego.
     """
     points = route_rig[np.isfinite(route_rig).all(axis=1), :2]
+    if len(points) and points[0, 0] > FAR_M:
+        points = np.concatenate([np.zeros((1, 2)), points])
     return points if len(points) >= 2 and float(np.hypot(*(points[-1] - points[0]))) > 0.5 else None
 
 

@@ -244,6 +244,14 @@ class TimingSpec(Part):
     )
 
 
+class RouteSpec(Part):
+    """What a policy is told of its route, as 20 points 4.21 m apart."""
+
+    start_offset_m: float = number(
+        0, 80, "How far ahead of the ego its points begin; nearer ones are left out.", 0.0
+    )
+
+
 class LatencySpec(Part):
     """Delay from observation to the plan taking effect."""
 
@@ -405,6 +413,7 @@ class ScenarioSpec(Part):
     ) = field("None: the log's own, or one named front.", None)
     rates: RatesSpec = field("Periods of the loop.", RatesSpec())
     timing: TimingSpec = field("Start, length and warm-up.", TimingSpec())
+    route: RouteSpec = field("What a policy is told of its route.", RouteSpec())
     latency: LatencySpec = field("Delay of the policy.", LatencySpec())
     degradation: DegradationSpec = field("Degradation of the renderer 3dgs.", DegradationSpec())
     background: BackgroundSpec | None = field("A Gaussian file as background.", None)
@@ -479,6 +488,7 @@ def models() -> dict[str, type[BaseModel]]:
         "cameras (a set)": CameraSet,
         "rates": RatesSpec,
         "timing": TimingSpec,
+        "route": RouteSpec,
         "latency": LatencySpec,
         "degradation": DegradationSpec,
         "background": BackgroundSpec,

@@ -387,7 +387,8 @@ class Observation:
     cameras: Mapping[str, CameraSpec]  # calibration of each camera, by name
     ego: EgoState  # at t_us
     history: Trajectory  # rig poses in the world up to t_us
-    route_rig: F64  # (20, 3) metres, rig frame now; rows of NaN where the route ends
+    # (20, 3) metres, rig frame now, from `Scenario.route_offset_m` on; rows of NaN behind its end
+    route_rig: F64
     images: Mapping[str, Any] = field(
         default_factory=dict
     )  # images that lie on a device; `image` gives any
@@ -565,6 +566,8 @@ class Scenario:
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
     path_end: PathEndKind = "record"  # what the end of the path is
     stop_at_path_end: bool = True  # see `alpasim_plugin.core.path_end`
+    # how far ahead of the ego the points of `Observation.route_rig` begin
+    route_offset_m: float = 0.0
     # what the loader read beside the scenario file: path -> digest of the content
     files: Mapping[str, str] = field(default_factory=dict)
 

@@ -173,6 +173,7 @@ _NO_MATTER = frozenset(
         "files",
         "source_part",
         "stop_at_path_end",
+        "route_offset_m",
         "varied",
     }
 )

@@ -43,7 +43,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.route import route_in_rig
+from alpasim_plugin.world.route import from_offset, route_in_rig
 
 
 def visible_actors(actors: Mapping[str, F64]) -> Mapping[str, F64]:
@@ -161,7 +161,10 @@ class LoopState:
             dict(cameras),
             read_only(self.ego),
             read_only(self.history),
-            route_in_rig(self.scenario.route, self.ego.T_world_rig),
+            from_offset(
+                route_in_rig(self.scenario.route, self.ego.T_world_rig),
+                self.scenario.route_offset_m,
+            ),
             {name: self.frames[name].image() for name in tensors},
         )
 

@@ -319,6 +319,22 @@ def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float =
     return out
 
 
+def from_offset(route_rig: F64, offset_m: float) -> F64:
+    """Return a route ``(n, 3)`` without its points nearer than ``offset_m``, as many rows of NaN
+    behind the others.
+
+    Distances are summed along the points, as AlpaSim sums them for ``route_start_offset_m``
+    (`alpasim_runtime/route_generator.py`, branch ``e2e_challenge``, commit 9177bd0).
+    """
+    if offset_m <= 0.0:
+        return route_rig
+    points = route_rig[np.isfinite(route_rig).all(axis=1)]
+    ahead = points[arc_lengths(points) >= offset_m] if len(points) else points
+    out = np.full_like(route_rig, np.nan)
+    out[: len(ahead)] = ahead
+    return out
+
+
 def _on_segments(line: F64, xy: F64) -> tuple[F64, F64, F64]:
     """Return the segments ``(S, 2)`` of a polyline, the share of each at which it is nearest to a
     point, and the offsets there.

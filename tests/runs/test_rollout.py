@@ -18,6 +18,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.recorder import Recorder
+from policies.simple import PurePursuit
 from tests.examples import first_of
 
 
@@ -97,6 +98,24 @@ class LateBrake(StandStill):
             along = (plan.times_us - plan.t_us) * 1e-6 * 10.0
             return replace(plan, xy=np.stack([along, np.zeros(3)], axis=1))
         return plan
+
+
+def test_the_policy_is_told_its_route_from_the_scenario_s_offset_on(straight_road):
+    """And pure pursuit drives straight to where it begins."""
+    asked = []
+
+    class Asked(PurePursuit):
+        def act(self, observation):
+            asked.append(observation.route_rig)
+            return super().act(observation)
+
+    scenario = replace(straight_road, route_offset_m=40.0)
+    log = run_rollout(scenario, make_renderer("clean", scenario), Asked(scenario), 0).log()
+    whole = run_rollout(
+        straight_road, make_renderer("clean", straight_road), PurePursuit(straight_road), 0
+    ).log()
+    assert {round(float(route[0, 0]), 1) for route in asked[:5]} == {42.1}
+    assert_allclose(log.ego.xyz, whole.ego.xyz, atol=0.05)
 
 
 def test_a_fixed_latency_delays_the_reaction_by_exactly_that_time(straight_road):

@@ -18,6 +18,7 @@ from alpasim_plugin.world.route import (
     LaneIndex,
     _change_cost,
     _local_costs,
+    from_offset,
     match_lanes,
     route_from_log,
     route_in_rig,
@@ -112,6 +113,27 @@ def test_way_points_start_at_the_projection_and_are_evenly_spaced():
     assert seen.shape == (20, 3)
     assert_allclose(seen[:, 0], np.arange(20) * 80 / 19, atol=1e-9)
     assert_allclose(seen[:, 1], -2.0, atol=1e-12)
+
+
+def test_a_route_from_an_offset_on_begins_with_the_first_point_that_is_so_far_along_it():
+    """Ten points 42.1 to 80 m ahead and ten rows of NaN, as AlpaSim's own test of its offset of 40 m
+    has it (`src/runtime/tests/test_route_generator.py`, branch e2e_challenge).
+    """
+    whole = route_in_rig(
+        Route(np.column_stack([np.arange(200.0), np.zeros((200, 2))])), se2(0, 0, 0)
+    )
+    cut = from_offset(whole, 40.0)
+    assert_allclose(cut[:10], whole[10:])
+    assert cut[0, 0] == pytest.approx(10 * 80 / 19)
+    assert np.isnan(cut[10:]).all()
+    assert_array_equal(from_offset(whole, 0.0), whole)
+
+
+def test_a_route_that_ends_before_the_offset_has_no_points_left():
+    short = route_in_rig(Route(np.column_stack([np.arange(30.0), np.zeros((30, 2))])), se2(0, 0, 0))
+    assert np.isfinite(short).any()
+    assert np.isnan(from_offset(short, 40.0)).all()
+    assert np.isnan(from_offset(np.full((20, 3), np.nan), 40.0)).all()
 
 
 def test_route_over_itself_is_followed_in_the_ego_s_direction():
