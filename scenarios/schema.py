@@ -181,8 +181,8 @@ class CameraModel(Part):
 class CameraSet(Part):
     """Cameras of a shipped rig, or of a calibration, in place of a list."""
 
-    rig: Literal["alpasim-4", "alpasim-6", "front", "surround-6"] | None = field(
-        "Name of a shipped rig.", None
+    rig: Literal["alpasim-4", "alpasim-4-and-front", "alpasim-6", "front", "surround-6"] | None = (
+        field("Name of a shipped rig.", None)
     )
     from_: str | None = Field(
         default=None,

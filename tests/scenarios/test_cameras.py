@@ -46,7 +46,13 @@ def test_the_order_of_listing_changes_no_scenario(tmp_path):
 
 @pytest.mark.parametrize(
     ("rig", "count", "pinholes"),
-    [("front", 1, 1), ("alpasim-4", 4, 10), ("alpasim-6", 6, 12), ("surround-6", 6, 6)],
+    [
+        ("front", 1, 1),
+        ("alpasim-4", 4, 10),
+        ("alpasim-4-and-front", 5, 11),
+        ("alpasim-6", 6, 12),
+        ("surround-6", 6, 6),
+    ],
 )
 def test_a_shipped_rig_is_read_and_scaled(tmp_path, rig, count, pinholes):
     cameras = load_scenario(written(tmp_path, f"{{rig: {rig}, width: 192}}")).cameras

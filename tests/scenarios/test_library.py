@@ -74,12 +74,28 @@ def test_smoke_scenarios_are_short_and_small(name):
 
 
 def test_suites_hold_what_their_folders_hold():
-    for name in ("urban", "highway", "hard"):
+    for name in ("urban", "highway", "hard", "challenge"):
         assert [Path(r.path).stem for r in load_suite(name)] == [
             n.split("/")[1] for n in BUILT if n.startswith(name)
         ]
-    assert len(load_suite(SHIPPED)) == len(shipped_names()) == SHIPPED_SCENES
+    shorter = [name for name in shipped_names() if not name.startswith("challenge/")]
+    assert len(load_suite(SHIPPED)) == len(shorter) == SHIPPED_SCENES
     for name in ("smoke", "gate_self_test"):  # a driver that does not look hits the leader
         assert "hard_brake" in [Path(r.path).stem for r in load_suite(f"suites/{name}")]
-    names = ("smoke", "urban", "highway", "hard", "all", "gate_self_test", "first")
+    names = ("smoke", "urban", "highway", "hard", "all", "gate_self_test", "first", "challenge")
     assert set(suites()) == {f"suites/{name}" for name in names}
+
+
+def test_scenes_of_the_challenge_last_20_s_and_have_its_cameras_beside_a_pinhole():
+    refs = load_suite("suites/challenge")
+    kinds = {Path(ref.path).stem.partition("_")[0] for ref in refs}
+    assert kinds == {"street", "junction", "town"}
+    scene = load_scenario(refs[0].path)
+    assert scene.end_us - scene.start_us == 20_000_000
+    assert {camera.name for camera in scene.cameras if camera.lens is not None} == {
+        "camera_front_wide_120fov",
+        "camera_front_tele_30fov",
+        "camera_cross_left_120fov",
+        "camera_cross_right_120fov",
+    }
+    assert [camera.name for camera in scene.cameras if camera.lens is None] == ["front"]
