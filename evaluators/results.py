@@ -470,6 +470,25 @@ class Slowing:
 
 
 @dataclass(frozen=True)
+class DriveCalls:
+    """How long an AlpaSim driver took for its drive calls, against the challenge's budget.
+
+    Attributes:
+        calls: Drive calls of all finished rollouts.
+        seconds: That all of them took, on this machine.
+        budget_s: That the challenge gives so many calls.
+        late: Calls that took longer.
+        longest_s: The longest call, seconds.
+    """
+
+    calls: int
+    seconds: float
+    budget_s: float
+    late: int
+    longest_s: float
+
+
+@dataclass(frozen=True)
 class FixerFacts:
     """What a fixer did over the rollouts of its renderer.
 
@@ -526,6 +545,8 @@ class Summary:
         speed: VARIANT -> time per frame.
         slowing: POLICY -> how much longer its plans take at the end of a rollout; only of policies
             whose plans do.
+        drive_calls: POLICY -> its drive calls against the challenge's budget; only of AlpaSim's
+            drivers.
         pool: Throughput of the workers; None where nothing was driven.
         repeat: What ``--repeat`` found.
         exit_code: Of ``simrun score``.
@@ -547,6 +568,7 @@ class Summary:
     fixers: dict[str, FixerFacts] = field(default_factory=dict)
     speed: dict[str, Speed] = field(default_factory=dict)
     slowing: dict[str, Slowing] = field(default_factory=dict)
+    drive_calls: dict[str, DriveCalls] = field(default_factory=dict)
     pool: Pool | None = None
     repeat: Repeat | None = None
     exit_code: int | None = None

@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
-from alpasim_plugin.alpasim.client.driver import AlpasimPolicy
+from alpasim_plugin.alpasim.client.driver import BUDGET_S, DriverPolicy
 from alpasim_plugin.alpasim.client.preflight import (
-    LIMIT_S,
     DriveTimes,
     findings,
     tolerances,
 )
+from alpasim_plugin.cli.driver_sessions import driver_at, session_findings
 from alpasim_plugin.cli.options import Json, Run, run_or_newest, typer_of
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InfrastructureError, PolicyError, SimrunError
@@ -61,6 +61,8 @@ Examples:
 - `simrun check driver 127.0.0.1:50052`
 
 - `simrun check driver my-driver:6000 --scenario scenes/one.usdz`
+
+- `simrun check driver "exec:env ALPASIM_DRIVER_PORT={port} python driver.py"`: its root is read-only, and it is started anew
 
 Exit codes: 0 nothing failed; 1 a check failed; 4 the driver cannot be reached.
 """
@@ -161,27 +163,33 @@ def _outcomes(log: RolloutLog, scene: Scene) -> tuple[str, ...]:
 
 def check_driver(
     address: Annotated[
-        str, Positional("The driver, with options as after alpasim://.", metavar="HOST:PORT")
+        str,
+        Positional(
+            "The driver, with options as after alpasim://, or the command that starts it.",
+            metavar="HOST:PORT|exec:COMMAND",
+        ),
     ],
     scenario: Annotated[
         str, Flag("What it drives through: a scenario, or a suite.")
     ] = "smoke/curve",
     limit_ms: Annotated[
         float, Flag("Longest drive call; the challenge allows 100.", min=0.1)
-    ] = LIMIT_S * 1000,
+    ] = BUDGET_S * 1000,
     as_json: Json = False,
 ) -> None:
-    """Check an AlpaSim driver: order of calls, times, plans, and what it must tolerate."""
+    """Check an AlpaSim driver: order of calls, times, plans, several sessions, and what it must
+    tolerate.
+    """
     times = DriveTimes()
     ended: dict[str, str] = {}
-    policy: AlpasimPolicy | None = None
+    policy: DriverPolicy | None = None
     failed: SimrunError | None = None
     warmup = 0
     for ref in expand(scenario, ("timing.timeline=alpasim",)):
         scene = load_scenario(ref.path, ref.seed, ref.overrides)
         if policy is not None:
             policy.service.close()
-        policy = AlpasimPolicy(scene, address)
+        policy = driver_at(scene, address)
         times.watch(policy.service)
         warmup += scene.warmup_us // scene.rates.policy_us + 1
         try:
@@ -195,6 +203,7 @@ def check_driver(
     checks = [
         *findings(times, failed, warmup, limit_ms / 1000),
         *tolerances(policy.service, scene.scene_id),
+        *([] if isinstance(failed, InfrastructureError) else session_findings(scene, address)),
     ]
     code = BROKEN if any(check.result == "failed" for check in checks) else 0
     driver = policy.facts()["driver"]

@@ -30,6 +30,7 @@ from alpasim_plugin.cli.output import (
     varied_lines,
     warn,
 )
+from alpasim_plugin.cli.settings import load_settings
 from alpasim_plugin.core.errors import InputError, Stopped
 from alpasim_plugin.core.flags import Flag, Positional
 from alpasim_plugin.core.parts import split_names
@@ -46,6 +47,7 @@ from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, exec
 from alpasim_plugin.runs.shards import shard_of
 from alpasim_plugin.runs.vary import BoundarySearch, Sweep, parse_sweeps
 from evaluators import preset as find_preset
+from evaluators.metrics.presets import DEFAULT
 from evaluators.pages.decision import decision_lines
 from evaluators.results import FailedRollout, to_json
 from evaluators.statistics.decision import Question, metric_question
@@ -103,6 +105,17 @@ class Rollouts:
             "--set",
         ),
     ] = ()
+    settings: Annotated[
+        str | None,
+        Flag(
+            "Shipped settings, or a file of them: keys that stand before --set, with preset and workers.",
+            metavar="NAME|FILE",
+        ),
+    ] = None
+    preset: Annotated[
+        str | None,
+        Flag(f"Evaluator preset; default: of the settings, else {DEFAULT}.", names="preset"),
+    ] = None
     start: Annotated[
         str | None, Flag("Start of the route on a map, ROAD:S; by default drawn.", "--from")
     ] = None
@@ -123,25 +136,25 @@ class Rollouts:
     ] = None
     shard: Annotated[str | None, Flag("Drive this part of the scenes alone.", metavar="I/N")] = None
 
-    def settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    def overrides_of(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the settings ``KEY=VALUE`` of the scenarios, the ends of the route among them, and
-        those of the fixers.
+        those of the fixers: first those of a settings file.
         """
         ends = {"from": self.start, "to": self.goal, "length_m": self.route_length}
         route = [f"map.route.{key}={value}" for key, value in ends.items() if value is not None]
         if self.via:
             route.append(f"map.route.via={json.dumps(list(self.via))}")
-        return split_overrides((*self.overrides, *route))
+        return split_overrides((*load_settings(self.settings).overrides, *self.overrides, *route))
 
     def scenes(self, scenarios: Sequence[str]) -> list[ScenarioRef]:
         """Return the scenes of the scenarios that the command names, or of its shard of them."""
-        of_scene, _ = self.settings()
+        of_scene, _ = self.overrides_of()
         refs = _scenes(scenarios, of_scene, self.source)
         return refs if self.shard is None else shard_of(refs, self.shard)
 
     def planner(self, options: RunOptions) -> Planner:
         """Return the function that plans these rollouts of some scenes."""
-        _, of_fixer = self.settings()
+        _, of_fixer = self.overrides_of()
         return partial(
             make_plan,
             renderers=split_names(self.renderer),
@@ -261,6 +274,9 @@ def run(
     An interrupted run continues when the same command is given again.
     """
     executor = parse_executor(execution.executor)
+    settings = load_settings(rollouts.settings)
+    options = replace(options, preset=rollouts.preset or settings.preset or DEFAULT)
+    execution = replace(execution, workers=execution.workers or settings.workers)
     find_preset(options.preset)
     refs = rollouts.scenes(scenarios)
     planned = rollouts.planner(options)

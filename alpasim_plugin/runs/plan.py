@@ -34,7 +34,7 @@ SIMRUN = "simrun"  # its code, among what a rollout is made of
 class RunOptions:
     """Everything except the rollouts that determines a run's results."""
 
-    preset: Annotated[str, Flag("Evaluator preset.", names="preset")] = DEFAULT
+    preset: str = DEFAULT
     images: Annotated[Literal["none", "jpeg", "png"], Flag("Camera frames in rollout.asl.")] = (
         "jpeg"
     )

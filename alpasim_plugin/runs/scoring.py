@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, yaw_from_quat
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.parts import PartSpec
@@ -23,6 +24,9 @@ from alpasim_plugin.log import read_asl, read_facts
 from alpasim_plugin.log.run_folder.records import Contact, DriveEvent, Ledger, Manifest, MetricValue
 from evaluators import Preset, Reduction, contact_events, reduce_rollout, score
 from evaluators import preset as find_preset
+from evaluators.alpasim import scene_score
+from evaluators.alpasim.settings import SceneScoreSettings
+from evaluators.metrics import METRICS
 from evaluators.metrics.route import lateral_bias
 
 # Of a speculative fixer: distance of the camera pose of the shown frame, and of the forecast pose,
@@ -109,12 +113,29 @@ def tabulate(
     for name in FIXER_FACTS:
         rows += [_row(facts["t_us"], name, facts[name]) for facts in frames if name in facts]
     scores = Scores(
-        metrics=reduction.values,
+        metrics={**reduction.values, **_scene_score(reduction.values, chosen)},
         events=_placed(rollout, reduction),
         contacts=tuple(contact.rounded() for contact in contacts),
         censored=reduction.ledger,
     )
     return rows, scores
+
+
+def _scene_score(values: Mapping[str, MetricValue], preset: Preset) -> dict[str, MetricValue]:
+    """Return AlpaSim's score of a rollout under its presets, with its usual settings; nothing under
+    others, and a reason where a metric that it needs is missing.
+    """
+    if not preset.has_scene_score:
+        return {}
+    metric = METRICS["scene_score"]
+    numbers = {name: entry.value for name, entry in values.items()}
+    try:
+        score = scene_score(numbers, SceneScoreSettings()).score
+    except EvaluatorError as error:
+        return {
+            "scene_score": MetricValue(None, False, error.message, metric.unit, metric.direction)
+        }
+    return {"scene_score": MetricValue(score, True, "", metric.unit, metric.direction)}
 
 
 def _ego_rows(rollout: RolloutLog) -> list[JsonObject]:

@@ -26,6 +26,7 @@ from alpasim_plugin.runs.provenance import fixers
 from evaluators import censoring
 from evaluators.metrics import MetricTable
 from evaluators.results import (
+    DriveCalls,
     FailedRollout,
     Failures,
     Slowing,
@@ -97,6 +98,7 @@ def summary_of(info: RunInfo, manifests: Sequence[Manifest], rollouts: pa.Table)
             {policy: _speeds(policy_manifests) for policy, policy_manifests in finished.items()}
         ),
         slowing=slowing_of(finished),
+        drive_calls=drive_calls_of(finished),
         pool=info.pool,
         repeat=info.repeat,
         exit_code=info.exit_code,
@@ -217,6 +219,23 @@ def slowing_of(manifests_by_policy: Mapping[str, Sequence[Manifest]]) -> dict[st
                 n_rollouts=int(np.sum(grows)),
             )
     return slowing
+
+
+def drive_calls_of(manifests_by_policy: Mapping[str, Sequence[Manifest]]) -> dict[str, DriveCalls]:
+    """Return the drive calls of each policy that is an AlpaSim driver."""
+    calls: dict[str, DriveCalls] = {}
+    for policy, manifests in manifests_by_policy.items():
+        facts = [manifest.policy_facts or {} for manifest in manifests]
+        timed = [fact for fact in facts if fact.get("drive_calls", 0) > 0]
+        if timed:
+            calls[policy] = DriveCalls(
+                calls=sum(fact["drive_calls"] for fact in timed),
+                seconds=round(sum(fact["drive_s"] for fact in timed), 3),
+                budget_s=round(sum(f["drive_calls"] * f["drive_budget_s"] for f in timed), 3),
+                late=sum(fact["drive_late"] for fact in timed),
+                longest_s=max(fact["drive_longest_s"] for fact in timed),
+            )
+    return calls
 
 
 def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed:

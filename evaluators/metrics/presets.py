@@ -95,6 +95,7 @@ class Preset:
     replay_is_scored: bool = (
         False  # a rollout that never leaves the warm-up: scored whole, or invalid
     )
+    has_scene_score: bool = False  # AlpaSim's score of a rollout, with its usual settings
     honour_valid: bool = True  # skip invalid steps, or reduce over every row
     stop_after: tuple[str, ...] = (
         "collision_any",
@@ -145,6 +146,7 @@ ALPASIM = Preset(
     image_rule="at_or_after_step",
     aliases=True,
     replay_is_scored=True,
+    has_scene_score=True,
     honour_valid=False,
     stop_beyond_gt_m=4.0,
     drop_black=True,

@@ -30,3 +30,13 @@ def policy_cautions(run: Run) -> list[str]:
             f"(in {plural(slowing.n_rollouts, 'rollout')})."
         )
     return cautions
+
+
+def drive_call_lines(run: Run) -> list[str]:
+    """Say how the drive calls of AlpaSim's drivers stand to the challenge's budget."""
+    return [
+        f"{policy}: {plural(calls.calls, 'drive call')} took {short(calls.seconds)} s of the "
+        f"challenge's budget of {short(calls.budget_s)} s; "
+        f"{calls.late} took longer, the longest {short(calls.longest_s)} s."
+        for policy, calls in run.summary.drive_calls.items()
+    ]

@@ -6,13 +6,14 @@ import html
 import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.runs.summary import slowing_of
+from alpasim_plugin.runs.summary import drive_calls_of, slowing_of
 from evaluators.pages.overview import overview_of
-from evaluators.results import Slowing
+from evaluators.results import DriveCalls, Slowing
 from evaluators.statistics.opening import read_run
 from tests.run_records import manifest
 
@@ -89,3 +90,18 @@ def test_plans_that_take_longer_and_longer_are_noticed(run):
     slow = replace(driven, summary=replace(driven.summary, slowing=slowing))
     (caution,) = [text for text in overview_of(slow).cautions if "longer and longer" in text]
     assert "5.00 ms for a plan in the first quarter of a rollout, 40.0 ms in the last" in caution
+
+
+def test_drive_calls_of_a_driver_are_said_beside_the_challenge_s_budget(run):
+    facts = {"drive_calls": 20, "drive_s": 1.5, "drive_longest_s": 0.125, "drive_late": 1}
+    timed = SimpleNamespace(policy_facts={**facts, "drive_budget_s": 0.1})
+    untimed = SimpleNamespace(policy_facts=None)
+    calls = drive_calls_of({"driver": [timed, timed, untimed], "mine": [untimed]})
+    assert calls == {
+        "driver": DriveCalls(calls=40, seconds=3.0, budget_s=4.0, late=2, longest_s=0.125)
+    }
+    driven = read_run(run)
+    assert not any("drive calls" in text for text in overview_of(driven).cautions)
+    timed_run = replace(driven, summary=replace(driven.summary, drive_calls=calls))
+    (line,) = [text for text in overview_of(timed_run).cautions if "drive calls" in text]
+    assert "40 drive calls took 3.00 s of the challenge's budget of 4.00 s; 2 took longer" in line

@@ -18,6 +18,8 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.recorder import Recorder
+from alpasim_plugin.runs.scoring import tabulate
+from evaluators import score
 from policies.simple import PurePursuit
 from tests.examples import first_of
 
@@ -268,3 +270,27 @@ def test_a_failed_rollout_leaves_no_finished_log(straight_road, tmp_path):
     with pytest.raises(PolicyError), recorder:
         run_rollout(straight_road, make_renderer("clean", straight_road), Raises(), 0, recorder)
     assert not (tmp_path / LOG_NAME).exists()
+
+
+def test_a_rollout_under_alpasim_s_presets_has_its_scene_score(straight_road):
+    """The share of the recording's way, over 0.8, and nothing under other presets."""
+    recorder = drive(straight_road, "log-replay")
+    log = recorder.log()
+    for preset in ("alpasim", "alpasim@6f1029c"):
+        _, scores = tabulate(log, score(log, straight_road.scene, preset), preset)
+        mark = scores.metrics["scene_score"]
+        share = min(scores.metrics["progress_clipped_rel"].value / 0.8, 1.0)
+        assert (mark.value, mark.valid) == (pytest.approx(share), True)
+    _, scores = tabulate(log, score(log, straight_road.scene, "strict"), "strict")
+    assert "scene_score" not in scores.metrics
+
+
+def test_a_scene_score_that_lacks_a_metric_has_no_value(straight_road):
+    log = drive(straight_road, "log-replay").log()
+    series = score(log, straight_road.scene, "alpasim")
+    _, scores = tabulate(
+        log, [one for one in series if one.name != "gt_dist_traveled_m"], "alpasim"
+    )
+    mark = scores.metrics["scene_score"]
+    assert (mark.value, mark.valid) == (None, False)
+    assert "missing metric 'gt_dist_traveled_m'" in mark.reason

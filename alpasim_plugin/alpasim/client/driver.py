@@ -12,6 +12,7 @@ own runtime sends zeros until it hands over.
 import itertools
 import os
 import re
+import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -48,6 +49,8 @@ from alpasim_plugin.log.wire import FRONT_WIDE, common_pb2, egodriver_pb2
 from alpasim_plugin.log.wire.services import MESSAGE_BYTES
 
 OPTIONS = ("cameras", "encoding", "timeout_s")
+ALL_CAMERAS = "all"  # in place of names
+BUDGET_S = 0.1  # of a drive call, in AlpaSim's public challenge
 HOLD_US = 5_000_000  # length of the straight plan that stands in for an empty answer in the warm-up
 # An image of noise at the quality of `encode_image`, rounded up; PNG leaves it as it is.
 MOST_BYTES_PER_PIXEL: Mapping[ImageEncoding, float] = {"png": 3.1, "jpeg": 2.5}
@@ -94,6 +97,8 @@ class DriverPolicy(Policy):
         self._now_us = None
         self._sent_us, self._image_us = -1, dict.fromkeys(self._cameras, -1)
         self._facts |= {"empty_plans": 0, "shortest_plan_s": None, "samples_cut": 0, "calls": 0}
+        self._facts |= {"drive_calls": 0, "drive_s": 0.0, "drive_longest_s": 0.0, "drive_late": 0}
+        self._facts["drive_budget_s"] = BUDGET_S
         request = egodriver_pb2.DriveSessionRequest
         listed = [wire_camera(camera, name) for name, camera in self._cameras.items()]
         self._call(
@@ -116,6 +121,11 @@ class DriverPolicy(Policy):
                 no plan, or empty after the warm-up.
             InfrastructureError: The connection is lost.
         """
+        self.tell(observation)
+        return self.ask(observation)
+
+    def tell(self, observation: Observation) -> None:
+        """Send what is new: images, the ego's motion and the route."""
         now = self._now_us = observation.t_us
         self._send_images(observation.frames)
         self._send_motion(observation)
@@ -124,12 +134,17 @@ class DriverPolicy(Policy):
         self._call(
             "submit_route", egodriver_pb2.RouteRequest(session_uuid=self._session, route=route)
         )
+
+    def ask(self, observation: Observation) -> Plan:
+        """Return the driver's plan for an observation that it was told."""
         query = egodriver_pb2.DriveRequest(
             session_uuid=self._session,
-            time_now_us=now,
-            time_query_us=now + self._scenario.rates.control_us,
+            time_now_us=observation.t_us,
+            time_query_us=observation.t_us + self._scenario.rates.control_us,
         )
+        began = time.perf_counter()
         answer = self._call("drive", query)
+        self._time_call(time.perf_counter() - began)
         return self._plan(answer, observation)
 
     def end(self, frames: Mapping[str, Frame]) -> None:
@@ -145,6 +160,13 @@ class DriverPolicy(Policy):
             self._end_session()
         finally:
             self.service.close()
+
+    def _time_call(self, seconds: float) -> None:
+        """Count a drive call among those that AlpaSim's challenge has a budget for."""
+        self._facts["drive_calls"] += 1
+        self._facts["drive_s"] = round(self._facts["drive_s"] + seconds, 6)
+        self._facts["drive_longest_s"] = max(self._facts["drive_longest_s"], round(seconds, 6))
+        self._facts["drive_late"] += seconds > BUDGET_S
 
     def _end_session(self) -> None:
         if self._session:
@@ -301,8 +323,8 @@ def cameras_of(
 
     Args:
         scenario: Has the cameras.
-        text: ``THEIRS:OURS,...``, or ``OURS,...`` where the names are the same; None: the main
-            camera alone.
+        text: ``THEIRS:OURS,...``, or ``OURS,...`` where the names are the same; ``all``: every
+            camera by its own name; None: the main camera alone.
         main_name: What that is called; None: by its own name.
 
     Raises:
@@ -313,11 +335,12 @@ def cameras_of(
         (name for name in (FRONT_WIDE, "front") if name in cameras_by_name),
         next(iter(cameras_by_name), ""),
     )
-    pairs = (
-        [(main_name or main, main)]
-        if text is None
-        else [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
-    )
+    if text is None:
+        pairs = [(main_name or main, main)]
+    elif text == ALL_CAMERAS:
+        pairs = [(name, name) for name in cameras_by_name]
+    else:
+        pairs = [(a, b or a) for a, _, b in (part.partition(":") for part in text.split(","))]
     missing = [camera for _, camera in pairs if camera not in cameras_by_name]
     if missing or not pairs:
         problem = (
@@ -325,7 +348,7 @@ def cameras_of(
         )
         raise InputError(
             f"scene {scenario.scene_id!r}: {problem}",
-            "write ?cameras=THEIRS:OURS,...",
+            f"write ?cameras=THEIRS:OURS,..., or ?cameras={ALL_CAMERAS}",
         )
     return {name: cameras_by_name[camera] for name, camera in pairs}
 

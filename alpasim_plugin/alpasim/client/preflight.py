@@ -15,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 
 from alpasim_plugin.alpasim.client.channel import Service
+from alpasim_plugin.alpasim.client.driver import BUDGET_S
 from alpasim_plugin.core.errors import SimrunError
 from alpasim_plugin.log.wire import egodriver_pb2
 
-LIMIT_S = 0.1  # of a drive call, in the public challenge
 HORIZON_US = 2_000_000  # what AlpaSim's controller needs
 MINADE_US = 5_000_000  # what its evaluation needs
 Result = Literal["passed", "failed", "noted"]
@@ -101,7 +101,7 @@ class DriveTimes:
 
 
 def findings(
-    times: DriveTimes, failed: SimrunError | None, warmup_steps: int, limit_s: float = LIMIT_S
+    times: DriveTimes, failed: SimrunError | None, warmup_steps: int, limit_s: float = BUDGET_S
 ) -> list[Finding]:
     """Return what a driven session showed.
 

@@ -1,0 +1,68 @@
+"""What `simrun check driver` tries with several sessions of one driver."""
+
+import json
+import shutil
+import sys
+from concurrent import futures
+from pathlib import Path
+
+import grpc
+import pytest
+
+from alpasim_plugin.cli.driver_sessions import (
+    ANEW,
+    INTERLEAVED,
+    READ_ONLY,
+    session_findings,
+)
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.log.wire.services import handlers
+from scenarios.load import load_scenario
+from tests.alpasim.straight_driver import StraightDriver
+
+SCENE = """
+version: 1
+scene_id: sessions
+road: {segments: [{kind: straight, length_m: 120}]}
+cameras: [{width: 32, height: 24}]
+timing: {duration_us: 2200000, timeline: alpasim}
+"""
+PROGRAM = Path(__file__).with_name("straight_driver.py")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sessions") / "scene.yaml"
+    path.write_text(SCENE)
+    return str(path)
+
+
+@pytest.mark.parametrize(("apart", "result"), [(True, "passed"), (False, "failed")])
+def test_a_session_plans_as_alone_while_another_one_is_open(scene, apart, result):
+    server = grpc.server(futures.ThreadPoolExecutor(4))
+    server.add_generic_rpc_handlers((handlers("EgodriverService", StraightDriver(apart)),))
+    address = f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}"
+    server.start()
+    findings = {one.name: one for one in session_findings(load_scenario(scene), address)}
+    server.stop(0)
+    assert findings[INTERLEAVED].result == result, findings[INTERLEAVED].text
+    assert findings[READ_ONLY].result == findings[ANEW].result == "noted"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+def test_a_driver_that_is_started_here_is_tried_with_a_read_only_root_and_anew(scene, capsys):
+    results = {}
+    for argument in ("", " needs-its-folder"):
+        words = f"exec:{sys.executable} {PROGRAM}{argument}"
+        limits = ["--scenario", scene, "--limit-ms", "60000", "--json"]
+        code = run_command(["check", "driver", words, *limits])
+        document = json.loads(capsys.readouterr().out)
+        checks = {check["name"]: (check["result"], check["text"]) for check in document["checks"]}
+        assert checks[ANEW][0] == checks[INTERLEAVED][0] == "passed"
+        results[argument] = code, *checks[READ_ONLY]
+    if results[""][1] == "noted":
+        pytest.skip("this machine makes no read-only root")
+    assert results[""][:2] == (0, "passed")
+    assert results[" needs-its-folder"][:2] == (1, "failed")
+    assert "cannot write to" in results[" needs-its-folder"][2]
