@@ -23,9 +23,9 @@ RUN_FOLDER = A + "log.run_folder"
 STAGES = {
     A + "world": (),
     A + "cameras": (),
-    A + "gaussians": (),
+    A + "gaussians": (A + "cameras",),
     A + "gaussians.files": (A + "gaussians",),
-    A + "gaussians.raster": (A + "gaussians",),
+    A + "gaussians.raster": (A + "gaussians", A + "cameras"),
     A + "gaussians.scene": CLOUDS,
     A + "gaussians.fit": (*CLOUDS, A + "gaussians.scene"),
     A + "streets": (A + "world", *CLOUDS, A + "gaussians.scene"),

@@ -8,7 +8,7 @@ column j) is (j + 0.5, i + 0.5).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import Any, NamedTuple
@@ -300,9 +300,21 @@ def rays_of(camera: CameraSpec) -> Rays:
     Raises:
         InputError: Values that make no lens, or a lens that sees nothing.
     """
-    lens, K = _checked(camera)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    offset = np.stack([x, y], axis=-1).reshape(-1, 2) - K[:2, 2]
+    rays = rays_at(camera, np.stack([x, y], axis=-1).reshape(-1, 2))
+    _require(bool(rays.visible.any()), camera.name, "a lens that sees nothing at this size")
+    return rays
+
+
+def rays_at(camera: CameraSpec, pixels: F64) -> Rays:
+    """Return what a camera with a lens sees at places ``(N, 2)`` of its image, column and row; the
+    middle of the first pixel is (0.5, 0.5).
+
+    Raises:
+        InputError: Values that make no lens.
+    """
+    lens, K = _checked(camera)
+    offset = pixels - K[:2, 2]
     focal = float(K[0, 0]), float(K[1, 1])
     if lens.kind == "opencv":
         plane, visible = _undistorted(offset / focal, lens, focal)
@@ -321,7 +333,6 @@ def rays_of(camera: CameraSpec) -> Rays:
         ray = np.concatenate([across, np.cos(angle)[:, None]], axis=1)
         if lens.kind == "ftheta":
             focal = _ftheta_focal(lens), _ftheta_focal(lens)
-    _require(bool(visible.any()), camera.name, "a lens that sees nothing at this size")
     return Rays(ray, visible, focal)
 
 
@@ -351,6 +362,65 @@ def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
     size = np.array([camera.width, camera.height])
     inside = ((pixel > -BEYOND_PX) & (pixel < size + BEYOND_PX)).all(axis=1)
     return pixel, good & inside
+
+
+class RadialForm(NamedTuple):
+    """A lens as a distance from the middle by the angle from the axis, and what is added to it.
+
+    With the unit vector e across the axis, the pixel is ``linear (radius(angle) e + bent) + middle``.
+
+    Attributes:
+        linear: ``(2, 2)``.
+        radius: Distances ``(N,)`` of angles ``(N,)``, radians.
+        grows_to_rad: Up to which angle the distance grows, as far as the lens is described.
+        bent: Of the terms ``2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4`` and their like for y,
+            with x, y the tangents: p1, p2, s1, s2, s3, s4.
+    """
+
+    linear: F64
+    radius: Callable[[F64], F64]
+    grows_to_rad: float
+    bent: tuple[float, ...]
+
+
+def radial_form(camera: CameraSpec) -> RadialForm:
+    """Return a camera's lens in its radial form.
+
+    Raises:
+        InputError: Values that make no lens.
+    """
+    lens, K = _checked(camera)
+    if lens.kind == "opencv":
+        terms = np.zeros(12)
+        terms[: len(lens.coefficients)] = lens.coefficients
+        bent = tuple(float(term) for term in (*terms[2:4], *terms[8:]))
+        straight = terms.copy()
+        straight[[2, 3, 8, 9, 10, 11]] = 0.0
+        radial = replace(lens, coefficients=tuple(straight))
+
+        def radius(angle: F64) -> F64:
+            plane = np.column_stack([np.tan(angle), np.zeros_like(angle)])
+            return _distorted(plane, radial)[:, 0]
+
+        return RadialForm(K[:2, :2], radius, _grows_to(radius, float(WIDEST_RAD)), bent)
+    linear = K[:2, :2] if lens.kind == "fisheye" else _linear(lens)
+    if lens.pixel_to_angle:
+        polynomial = np.array(lens.pixel_to_angle)
+        reach = 2 * float(np.hypot(camera.width, camera.height))
+
+        def radius(angle: F64) -> F64:
+            return _inverse(polynomial, angle, reach, camera.name)[0]
+
+        return RadialForm(linear, radius, _grows_to(radius, _limit(lens)), (0.0,) * 6)
+    polynomial = _radius_of_angle(lens)
+    return RadialForm(linear, lambda angle: _value(polynomial, angle), _growing(lens), (0.0,) * 6)
+
+
+def _grows_to(radius: Callable[[F64], F64], limit: float) -> float:
+    """Return up to which angle a radius grows."""
+    angles = np.linspace(0.0, limit, TABLE)
+    falls = np.flatnonzero(np.diff(radius(angles)) <= 0)
+    return float(angles[falls[0]] if len(falls) else angles[-1])
 
 
 def place_in_lens(camera: CameraSpec, pinhole: Lens) -> tuple[F32, Bool]:
@@ -487,9 +557,8 @@ def _radius_of_angle(lens: LensModel) -> F64:
 
 def _growing(lens: LensModel) -> float:
     """Return up to which angle the lens's distance from the middle grows with it."""
-    angles = np.linspace(0.0, _limit(lens), TABLE)
-    falls = np.flatnonzero(np.diff(_value(_radius_of_angle(lens), angles)) <= 0)
-    return float(angles[falls[0]] if len(falls) else angles[-1])
+    polynomial = _radius_of_angle(lens)
+    return _grows_to(lambda angle: _value(polynomial, angle), _limit(lens))
 
 
 def _value(coefficients: Any, x: F64) -> F64:

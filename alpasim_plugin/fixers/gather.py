@@ -27,7 +27,7 @@ from alpasim_plugin.fixers.network.reference_blend import (
     Operations,
     ReferenceCells,
 )
-from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads
+from alpasim_plugin.gaussians.raster.stages import map_on_threads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
 BAND = 8  # rows of a smaller image that are enlarged at a time

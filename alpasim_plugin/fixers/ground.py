@@ -30,7 +30,7 @@ from alpasim_plugin.fixers.warp import (
     place_boxes,
     warp,
 )
-from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads
+from alpasim_plugin.gaussians.raster.stages import map_on_threads
 
 I32 = npt.NDArray[np.int32]
 

@@ -36,7 +36,7 @@ from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
 from alpasim_plugin.fixers.settings import FixerSettings
-from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
+from alpasim_plugin.gaussians.raster.stages import map_on_threads, thread_count
 
 Call = Callable[[Sequence[Frame], Sequence[U8]], Sequence[Frame]]
 ONE_BY_ONE = BlockRule(1, 1)

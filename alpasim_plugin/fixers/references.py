@@ -38,7 +38,7 @@ from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import planes_of
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
-from alpasim_plugin.gaussians.raster.rasterize_cpu import map_on_threads, thread_count
+from alpasim_plugin.gaussians.raster.stages import map_on_threads, thread_count
 
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
 KEPT_FRAMES = 24

@@ -33,8 +33,35 @@ class Rolling:
     reach_px: float
 
 
+class Posed:
+    """What is common to cameras at a pose, with or without a rolling shutter."""
+
+    T_camera_world: F64
+    rolling: Rolling | None
+
+    @property
+    def centre_world(self) -> F64:
+        """Return the camera centre ``(3,)``, metres, world."""
+        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+    def motion(self, T_world_node: F64, T_world_start: F64) -> F64:
+        """Return how a node moves as the camera sees it while the shutter is open: a rotation
+        vector and a shift, ``(6,)``; for each point p, ``turn x p + shift`` in a shutter.
+
+        Args:
+            T_world_node: ``(4, 4)`` at the middle of the shutter.
+            T_world_start: ``(4, 4)`` at its start.
+        """
+        assert self.rolling is not None, "nothing moves in a global shutter"
+        before = self.rolling.T_camera_world_start @ T_world_start
+        M = before @ inverse(self.T_camera_world @ T_world_node)
+        turn = cv2.Rodrigues(M[:3, :3])[0].ravel()
+        shift = M[:3, 3] - 0.5 * np.cross(turn, M[:3, 3])
+        return -2.0 * np.concatenate([turn, shift])  # half a shutter lies between
+
+
 @dataclass(frozen=True, eq=False)
-class PinholeCamera:
+class PinholeCamera(Posed):
     """A pinhole camera in OpenCV axes: x right, y down, z forward; the centre of pixel (row i,
     column j) is (j + 0.5, i + 0.5).
 
@@ -109,21 +136,6 @@ class PinholeCamera:
         more = int(np.ceil(by_px))
         return self.window(slice(-more, self.height + more), slice(-more, self.width + more))
 
-    def motion(self, T_world_node: F64, T_world_start: F64) -> F64:
-        """Return how a node moves as the camera sees it while the shutter is open: a rotation
-        vector and a shift, ``(6,)``; for each point p, ``turn x p + shift`` in a shutter.
-
-        Args:
-            T_world_node: ``(4, 4)`` at the middle of the shutter.
-            T_world_start: ``(4, 4)`` at its start.
-        """
-        assert self.rolling is not None, "nothing moves in a global shutter"
-        before = self.rolling.T_camera_world_start @ T_world_start
-        M = before @ inverse(self.T_camera_world @ T_world_node)
-        turn = cv2.Rodrigues(M[:3, :3])[0].ravel()
-        shift = M[:3, 3] - 0.5 * np.cross(turn, M[:3, 3])
-        return -2.0 * np.concatenate([turn, shift])  # half a shutter lies between
-
     @property
     def fx(self) -> float:
         """Return the horizontal focal length, pixels."""
@@ -143,11 +155,6 @@ class PinholeCamera:
     def cy(self) -> float:
         """Return the principal point's row, pixels."""
         return float(self.K[1, 2])
-
-    @property
-    def centre_world(self) -> F64:
-        """Return the camera centre ``(3,)``, metres, world."""
-        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     def above_horizon(self) -> Bool:
         """Return which pixels ``(H, W)`` look up, towards +z of the world."""

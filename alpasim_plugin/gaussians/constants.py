@@ -22,6 +22,7 @@ SLOPE_MARGIN = (
     0.3  # the Jacobian's slopes are clamped at this share of the half view beyond the image edge
 )
 LOG_SCALE_LIMIT = 20.0
+TIME_STEPS = 6  # by which the time of a mean's pixel is looked for, from the shutter's middle on
 
 
 # A camera's numbers, one float32 array.

@@ -39,7 +39,7 @@ from alpasim_plugin.fixers.semantic_map.style import (
     WIDTH_DEFINED_AT_PX,
     box_class,
 )
-from alpasim_plugin.gaussians.raster.rasterize_cpu import run_on_threads, thread_count
+from alpasim_plugin.gaussians.raster.stages import run_on_threads, thread_count
 
 EDGE_STYLE = np.array((BOX_EDGE_PX, EDGE_BIAS_M, *COLOURS["box_edge"]))
 

@@ -11,6 +11,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.types import F32, U8, Bool, FloatArray, Frame
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 
 OPAQUE = 0.5  # opacity from which a pixel shows a surface
 Background = tuple[float, float, float] | FloatArray
@@ -24,8 +25,8 @@ class RasterOutput:
         rgb: ``(H, W, 3)`` float32, 0..1, background included, clamped after compositing.
         alpha: ``(H, W)`` float32, accumulated opacity 1 - T; a wall of opaque splats ends at 0.99,
             not 1.
-        depth: ``(H, W)`` float32 metres along the optical axis, alpha-weighted mean over the splats
-            of the pixel; 0 where alpha is 0, so read it together with `alpha`. At silhouettes
+        depth: ``(H, W)`` float32 metres along the optical axis, through a lens from the camera's
+            centre, alpha-weighted mean over the splats of the pixel; 0 where alpha is 0, so read it together with `alpha`. At silhouettes
             it lies between the surfaces.
     """
 
@@ -103,7 +104,7 @@ class RasterOutput:
         return (self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
 
 
-def background_image(background: Background, camera: PinholeCamera) -> F32:
+def background_image(background: Background, camera: PinholeCamera | LensCamera) -> F32:
     """Return the background as ``(H, W, 3)`` float32, or ``(1, 1, 3)`` where it is one colour.
 
     Raises:

@@ -67,18 +67,20 @@ CHUNK = 16  # groups that a thread takes at once
 
 
 @kernel
-def _load3(array, offset):
+def load3(array, offset):
+    """Return three vectors that lie one after the other."""
     return v.load(array, offset), v.load(array, offset + 16), v.load(array, offset + 32)
 
 
 @kernel
-def _row(pose, offset):
+def row(pose, offset):
     """Return three numbers of a pose."""
     return pose[offset], pose[offset + 1], pose[offset + 2]
 
 
 @kernel
-def _dot(a, b):
+def dot(a, b):
+    """Return the dot product of sixteen vectors and sixteen others, or one that all share."""
     return v.fma(a[0], b[0], v.fma(a[1], b[1], a[2] * b[2]))
 
 
@@ -97,9 +99,9 @@ def _times(row, rows):
     """Return a row times a matrix of three rows."""
     a, b, c = rows
     return (
-        _dot(row, (a[0], b[0], c[0])),
-        _dot(row, (a[1], b[1], c[1])),
-        _dot(row, (a[2], b[2], c[2])),
+        dot(row, (a[0], b[0], c[0])),
+        dot(row, (a[1], b[1], c[1])),
+        dot(row, (a[2], b[2], c[2])),
     )
 
 
@@ -108,7 +110,7 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes):
     """Project sixteen Gaussians into ``lanes`` (RECORD columns of sixteen) and return the bit mask
     of those that reach the image.
     """
-    x, y, z = _load3(means, group * 48)
+    x, y, z = load3(means, group * 48)
     dx = x - pose[POSE_CENTRE]
     dy = y - pose[POSE_CENTRE + 1]
     dz = z - pose[POSE_CENTRE + 2]
@@ -122,12 +124,13 @@ def _project_group(group, means, geometry, sh, sh_size, pose, camera, lanes):
     d = v.to_f32(dx), v.to_f32(dy), v.to_f32(dz)
     chosen = _project_shape(group, mask, d, v.to_f32(z64), geometry, pose, camera, lanes)
     if chosen != 0:
-        _colour_group(group, d, sh, sh_size, lanes)
+        colour_group(group, d, sh, sh_size, lanes)
     return chosen
 
 
 @kernel
-def _cross(a, b):
+def cross(a, b):
+    """Return the cross product, likewise."""
     return (
         v.fnma(a[2], b[1], a[1] * b[2]),
         v.fnma(a[0], b[2], a[2] * b[0]),
@@ -142,9 +145,9 @@ def _at_its_time(p, turn, shift, camera):
     A point moves by ``turn x p + shift`` in a shutter, to second order; its time follows from its
     pixel, and its pixel from its time.
     """
-    tx, ty, tz = _cross(turn, p)
+    tx, ty, tz = cross(turn, p)
     first = tx + shift[0], ty + shift[1], tz + shift[2]
-    cx, cy, cz = _cross(turn, first)
+    cx, cy, cz = cross(turn, first)
     second = 0.5 * cx, 0.5 * cy, 0.5 * cz
     x, y, z = p
     for _ in range(3):
@@ -165,15 +168,15 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     """Write the ellipses of Gaussians at ``d`` from the camera's centre; returns the bit mask of
     those that reach the image.
     """
-    right = _row(pose, POSE_ROTATION)
-    down = _row(pose, POSE_ROTATION + 3)
-    ahead = _row(pose, POSE_ROTATION + 6)
+    right = row(pose, POSE_ROTATION)
+    down = row(pose, POSE_ROTATION + 3)
+    ahead = row(pose, POSE_ROTATION + 6)
     fx = camera[CAM_FX]
     fy = camera[CAM_FY]
-    x = _dot(right, d)
-    y = _dot(down, d)
+    x = dot(right, d)
+    y = dot(down, d)
     if camera[CAM_REACH] > 0:
-        x, y, z = _at_its_time((x, y, z), _row(pose, POSE_TURN), _row(pose, POSE_SHIFT), camera)
+        x, y, z = _at_its_time((x, y, z), row(pose, POSE_TURN), row(pose, POSE_SHIFT), camera)
     inverse_z = 1.0 / z
     slope_x = x * inverse_z
     slope_y = y * inverse_z
@@ -185,12 +188,12 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     # Rows m, n of M = J R R_q diag(s).
     geo = group * (GEO_SIZE * 16)
     f = geo + GEO_FACTOR * 16
-    factor = _load3(geometry, f), _load3(geometry, f + 48), _load3(geometry, f + 96)
+    factor = load3(geometry, f), load3(geometry, f + 48), load3(geometry, f + 96)
     m = _times(_jacobian_row(fx * inverse_z, a, right, ahead), factor)
     n = _times(_jacobian_row(fy * inverse_z, b, down, ahead), factor)
-    mm = _dot(m, m)
-    nn = _dot(n, n)
-    mn = _dot(m, n)
+    mm = dot(m, m)
+    nn = dot(n, n)
+    mn = dot(m, n)
     antialias = pose[POSE_ANTIALIAS]
     eps = antialias if antialias > 0 else EPS2D_PX2
     c11 = mm + eps
@@ -213,7 +216,7 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
     x02 = v.fnma(m[2], n[0], m[0] * n[2])
     x12 = v.fnma(m[2], n[1], m[1] * n[2])
     minors = x01 * root, x02 * root, x12 * root
-    raw_variance = _dot(minors, minors)
+    raw_variance = dot(minors, minors)
     variance = raw_variance + eps * ((c11 + nn) * inverse_c22)
     deviation = v.sqrt(variance)
     l11 = EXPONENT_SCALE / deviation
@@ -248,20 +251,20 @@ def _project_shape(group, mask, d, z, geometry, pose, camera, lanes):
 
 
 @kernel
-def _colour_group(group, d, sh, sh_size, lanes):
+def colour_group(group, d, sh, sh_size, lanes):
     """Write the colours of sixteen Gaussians at ``d`` from the camera's centre, clamped at 0
     below.
     """
     colour = group * sh_size * 48
-    red, green, blue = _load3(sh, colour)
+    red, green, blue = load3(sh, colour)
     red = v.fma(red, C0, 0.5)
     green = v.fma(green, C0, 0.5)
     blue = v.fma(blue, C0, 0.5)
     if sh_size > 1:
-        length = 1.0 / v.sqrt(_dot(d, d))
+        length = 1.0 / v.sqrt(dot(d, d))
         terms = _sh_terms(d[0] * length, d[1] * length, d[2] * length)
         for k in range(1, sh_size):
-            r, g, b = _load3(sh, colour + k * 48)
+            r, g, b = load3(sh, colour + k * 48)
             red = v.fma(terms[k - 1], r, red)
             green = v.fma(terms[k - 1], g, green)
             blue = v.fma(terms[k - 1], b, blue)

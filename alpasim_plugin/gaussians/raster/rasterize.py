@@ -7,6 +7,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.constants import NEAR_M
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput
 
 Backend = Literal["cpu", "reference", "torch", "triton"]
@@ -18,10 +19,12 @@ MODULES = {
     "triton": "rasterize_triton",
 }
 
+THROUGH_LENSES = ("cpu",)  # backends that draw what a camera with a lens sees
+
 
 def rasterize(
     cloud: GaussianCloud,
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     background: Background = (0.0, 0.0, 0.0),
     backend: Backend = "cpu",
     *,
@@ -31,7 +34,7 @@ def rasterize(
 
     Args:
         cloud: Gaussians in world coordinates.
-        camera: From where.
+        camera: From where; through a lens on the ``cpu`` alone.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything, 0..1.
         backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
             (that of the differentiable `rasterize_gradient`) or ``triton`` (GPU).
@@ -56,6 +59,11 @@ def rasterize(
     if backend not in MODULES:
         raise InputError(
             f"backend {backend!r}: no such backend", f"choose one of {', '.join(MODULES)}"
+        )
+    if isinstance(camera, LensCamera) and backend not in THROUGH_LENSES:
+        raise InputError(
+            f"backend {backend!r}: draws pinholes alone, and this camera has a lens",
+            "use the backend cpu",
         )
     module = import_module(f"{__package__}.{MODULES[backend]}")
     return getattr(module, f"rasterize_{backend}")(cloud, camera, background, near_m=near_m)

@@ -1,60 +1,43 @@
-"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads.
-
-Kernels release the interpreter lock and share work through an atomic counter, so the same compiled
-code serves any number of threads, nothing is lost by a fork, and one thread costs nothing extra.
-"""
+"""Render on the CPU: project, sort, list per tile, composite; each stage on all threads."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.places import require_kernels
-from alpasim_plugin.core.types import F32, F64, I64, FloatArray
+from alpasim_plugin.core.types import F32, F64, I64
 from alpasim_plugin.gaussians.camera import PinholeCamera
-from alpasim_plugin.gaussians.cloud import GaussianCloud, all_rigid, require_rigid
-from alpasim_plugin.gaussians.constants import (
-    FAR_M,
-    NEAR_M,
-    POSE_ANTIALIAS,
-    POSE_CENTRE,
-    POSE_FAR,
-    POSE_NEAR,
-    POSE_ROTATION,
-    POSE_SIZE,
-    POSE_TURN,
-    RECORD,
-    TILE,
-    Z,
-)
-from alpasim_plugin.gaussians.raster.binning import (
-    LOW_HALF,
-    count_tiles,
-    fill_tiles,
-    sorted_pairs,
-    tile_boxes,
-)
+from alpasim_plugin.gaussians.cloud import GaussianCloud
+from alpasim_plugin.gaussians.constants import NEAR_M, POSE_ANTIALIAS, RECORD, TILE, Z
+from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster.binning import tile_boxes
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import project_part
 from alpasim_plugin.gaussians.raster.raster_kernels import composite_tiles
+from alpasim_plugin.gaussians.raster.rasterize_lens import rasterize_lens
+from alpasim_plugin.gaussians.raster.stages import (
+    WORTH_THREADS,
+    TileLists,
+    depth_order,
+    list_boxes,
+    node_poses,
+    run_on_threads,
+    thread_count,
+    write_motion,
+)
 
 Part = tuple[Any, ...]
-_IDENTITY = np.eye(4)
-WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
 _prepared: weakref.WeakKeyDictionary[GaussianCloud, PreparedCloud] = weakref.WeakKeyDictionary()
 
 
 def rasterize_prepared(
     nodes: Sequence[Node],
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
@@ -66,7 +49,7 @@ def rasterize_prepared(
     Args:
         nodes: ``(prepared, T_world_node)`` pairs; None stands for the identity (a background in
             world coordinates). Equal depths are drawn in the order of the nodes.
-        camera: From where.
+        camera: From where; through a lens see `rasterize_lens`.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything.
         near_m: Gaussians whose centre is nearer are left out.
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
@@ -80,12 +63,16 @@ def rasterize_prepared(
     """
     require_kernels()
     threads = thread_count(threads)
+    if isinstance(camera, LensCamera):
+        return rasterize_lens(
+            nodes, camera, background, near_m=near_m, threads=threads, starts=starts
+        )
     behind = background_image(background, camera)
     view = camera_numbers(camera)
     poses = node_poses([T for _, T in nodes], camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
     if camera.rolling is not None:
-        _write_motion(poses, nodes, starts, camera)
+        write_motion(poses, nodes, starts, camera)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = [
         (*prepared.arrays(), end - prepared.n_input, pose)
@@ -109,39 +96,6 @@ def rasterize_prepared(
     return RasterOutput(*composite(tiles, records, None, behind, camera, threads))
 
 
-def _write_motion(
-    poses: F64, nodes: Sequence[Node], starts: Sequence[F64 | None], camera: PinholeCamera
-) -> None:
-    """Write into the numbers of the nodes' poses how each moves while the shutter rolls; a node
-    without both poses stands.
-    """
-    still = camera.motion(_IDENTITY, _IDENTITY)
-    for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
-        if T is None or T_start is None:
-            pose[POSE_TURN:] = still
-        else:
-            pose[POSE_TURN:] = camera.motion(np.asarray(T, dtype=np.float64), T_start)
-
-
-def depth_order(depths: F32, ids: I64) -> I64:
-    """Return the numbers ``(N,)`` of depths nearest first, equal ones by identity ``(N,)``.
-
-    Bits of depths sort as the depths do, which are not negative. The result does not depend on the
-    order in which threads wrote the records.
-    """
-    bits = depths.view(np.int32)
-    keys = bits - bits.min(initial=np.iinfo(np.int32).max)
-    pairs, has_ties = sorted_pairs(keys, int(keys.max(initial=0)).bit_length())
-    order = np.asarray(pairs & LOW_HALF, dtype=np.int64)
-    if has_ties:
-        is_like_next = np.diff(pairs >> 32) == 0
-        tied = np.flatnonzero(np.r_[is_like_next, False] | np.r_[False, is_like_next])
-        splats = order[tied]
-        # Equal depths lie side by side, so the tied ones alone, sorted again, fill their places.
-        order[tied] = splats[np.lexsort((ids[splats], keys[splats]))]
-    return order
-
-
 def camera_numbers(camera: PinholeCamera) -> F32:
     """Return a camera as the kernels read it, columns ``CAM_*``."""
     low_x, high_x, low_y, high_y = camera.slope_limits()
@@ -157,45 +111,11 @@ def camera_numbers(camera: PinholeCamera) -> F32:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class TileLists:
-    """Which visible splats each tile may show, nearest first.
-
-    Attributes:
-        columns: Tiles in a row of tiles.
-        starts: int64, where each tile's list begins, and the end of the last.
-        lists: int32, numbers of records, in the order of depth within a tile.
-    """
-
-    columns: int
-    starts: I64
-    lists: npt.NDArray[np.int32]
-
-
 def list_per_tile(order: I64, records: F32, camera: PinholeCamera, threads: int) -> TileLists:
     """List projected records per tile; ``order`` is that of `depth_order`."""
-    count = len(order)
-    tiles_x = -(-camera.width // TILE)
-    tiles_y = -(-camera.height // TILE)
-    # At most 64 chunks of at least 8192 splats: enough to share out, few enough to keep their tile
-    # counts small.
-    chunk_size = max(8192, -(-count // 64))
-    by_record = np.empty((count, 4), dtype=np.int16)
-    tile_boxes(records, tiles_x, tiles_y, by_record)
-    # A box is eight bytes, which are moved at once.
-    boxes = by_record.view(np.int64)[order].view(np.int16)
-    changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), dtype=np.int32)
-    workers = min(threads, max(1, len(changes) // 4))  # a millisecond of work for each
-    cursor = np.zeros(1, dtype=np.int64)
-    run_on_threads(workers, count_tiles, cursor, chunk_size, boxes, changes)
-    counts = changes.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1, tiles_x * tiles_y)
-    starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
-    before = np.cumsum(counts, axis=0) - counts
-    lists = np.empty(starts[-1], dtype=np.int32)
-    cursor[:] = 0
-    chunks = (cursor, chunk_size, order, boxes)
-    run_on_threads(workers, fill_tiles, *chunks, tiles_x, starts[:-1] + before, lists)
-    return TileLists(tiles_x, starts, lists)
+    boxes = np.empty((len(order), 4), dtype=np.int16)
+    tile_boxes(records, -(-camera.width // TILE), -(-camera.height // TILE), boxes)
+    return list_boxes(order, boxes, camera.width, camera.height, threads)
 
 
 def composite(
@@ -218,44 +138,9 @@ def composite(
     return colour, alpha, depth_sum
 
 
-def node_poses(
-    T_world_nodes: Sequence[FloatArray | None],
-    camera: PinholeCamera,
-    near_m: float,
-) -> F64:
-    """Pack nodes' poses relative to the camera, ``(N, POSE_SIZE)``, of clouds without antialiasing;
-    all differences of large coordinates happen here, in float64.
-
-    Args:
-        T_world_nodes: Rigid transforms; None is the identity.
-        camera: Seen from where.
-        near_m: Near plane, metres.
-
-    Raises:
-        InputError: A transform is not rigid.
-    """
-    poses = [_IDENTITY, *(np.asarray(T, dtype=np.float64) for T in T_world_nodes if T is not None)]
-    shaped = all(T.shape == (4, 4) for T in poses)
-    if not shaped or not all_rigid(np.array(poses)):
-        # The precise message is composed only where the cheap test of all nodes at once fails.
-        for T in poses:
-            require_rigid(T)
-    T_world_node = np.array(poses)
-    rotation = T_world_node[:, :3, :3]
-    placed = np.zeros((len(poses), POSE_SIZE))
-    placed[:, POSE_ROTATION:POSE_CENTRE] = (camera.T_camera_world[:3, :3] @ rotation).reshape(-1, 9)
-    placed[:, POSE_CENTRE:POSE_ANTIALIAS] = np.einsum(
-        "nji,nj->ni", rotation, camera.centre_world - T_world_node[:, :3, 3]
-    )
-    placed[:, POSE_NEAR], placed[:, POSE_FAR] = near_m, FAR_M
-    moved = np.array([T is not None for T in T_world_nodes], dtype=bool)
-    # All that stand in the world share the first
-    return placed[np.where(moved, np.cumsum(moved), 0)]
-
-
 def rasterize_cpu(
     cloud: GaussianCloud,
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,
@@ -273,47 +158,3 @@ def rasterize_cpu(
     return rasterize_prepared(
         [(prepared, None)], camera, background, near_m=near_m, threads=threads
     )
-
-
-def thread_count(threads: int | None) -> int:
-    """Return how many threads to use: the argument, or numba's current setting.
-
-    Raises:
-        InputError: Fewer than one.
-    """
-    if threads is None:
-        import numba
-
-        return int(numba.get_num_threads())
-    if threads < 1:
-        raise InputError(
-            f"threads={threads}: no thread to work with",
-            "give at least 1, or None for the default",
-        )
-    return threads
-
-
-def map_on_threads(threads: int, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Return what a function makes of each item, in their order; a thread that is free takes the
-    next.
-    """
-    if min(threads, len(items)) <= 1:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(min(threads, len(items))) as pool:
-        return list(pool.map(function, items))
-
-
-def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> None:
-    """Call ``function(*args)`` on each of ``threads`` threads, this one included, and return when
-    all have ended.
-
-    An exception in any of them is raised here.
-    """
-    if threads == 1:
-        function(*args)
-        return
-    with ThreadPoolExecutor(threads - 1) as pool:
-        others = [pool.submit(function, *args) for _ in range(threads - 1)]
-        function(*args)
-    for other in others:
-        other.result()

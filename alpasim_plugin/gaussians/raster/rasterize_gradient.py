@@ -51,14 +51,9 @@ from alpasim_plugin.gaussians.raster.gradient_kernels import (
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.project_kernels import BLOCK_HALF, MARGIN_PX
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT, KEPT
-from alpasim_plugin.gaussians.raster.rasterize_cpu import (
-    composite,
-    depth_order,
-    list_per_tile,
-    run_on_threads,
-    thread_count,
-)
+from alpasim_plugin.gaussians.raster.rasterize_cpu import composite, list_per_tile
 from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, tile_grid
+from alpasim_plugin.gaussians.raster.stages import depth_order, run_on_threads, thread_count
 from alpasim_plugin.gaussians.sh import C0, sh_terms
 
 _OPACITY_LIMIT = 1e-6  # opacities of exactly 0 and 1 have no finite logit

@@ -29,7 +29,7 @@ from alpasim_plugin.gaussians.constants import (
 )
 from alpasim_plugin.gaussians.raster.device_output import DeviceOutput
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.raster.rasterize_cpu import node_poses
+from alpasim_plugin.gaussians.raster.stages import node_poses
 
 BLOCK = 128  # Gaussians that one program projects
 CHUNK = 32  # splats after which a tile is tested for being full

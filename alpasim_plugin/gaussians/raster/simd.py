@@ -295,6 +295,16 @@ def to_f32(typingctx, a):
 
 
 @intrinsic
+def to_f64(typingctx, a):
+    """Return a float32 vector in float64."""
+
+    def codegen(context, builder, sig, args):
+        return builder.fpext(args[0], _VECTORS["f64"])
+
+    return F64X16(F32X16), codegen
+
+
+@intrinsic
 def lowest_bit(typingctx, value):
     """Return the position of the lowest set bit of a non-zero int64."""
 

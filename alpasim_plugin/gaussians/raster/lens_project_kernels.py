@@ -1,0 +1,629 @@
+"""Project prepared Gaussians through a lens, sixteen at a time, to records that are evaluated in 3D
+along each pixel's ray; the definition is `tests/gaussians/lens_reference.py`.
+
+In the camera's axes a Gaussian has its mean p at the distance n and the covariance S = L L^T with the
+low-pass in it. With w = L^-1 p of length o and an orthonormal basis q1, q2, w / o, its record holds the
+rows A = n q1 L^-1, B = n q2 L^-1, C = (n / o) (w / o) L^-1. On a ray d from the camera's centre its least
+Mahalanobis distance is ``q^2 = (a^2 + b^2) / (c^2 + (a^2 + b^2) / o^2)`` with a = A d and so on: the
+distance |w x L^-1 d|^2 / |L^-1 d|^2 of Wu et al., 3DGUT (2025), without its cancellation. Where c is
+negative the peak lies behind the centre, and c is taken as 0: what is left is o^2, the value at the centre.
+
+A ray that starts at another place o(t) has the moment m = o(t) x d, and the numerator becomes |(b + N1 m,
+N2 m - a, N3 m)|^2 with N_i = (n / o) det(L^-1) L q_i.
+"""
+
+# Numba's decorators and vector types are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+import numpy as np
+
+from alpasim_plugin.cameras.image_map import DEGREE
+from alpasim_plugin.core.kernels import kernel
+from alpasim_plugin.gaussians.constants import (
+    EPS2D_PX2,
+    GEO_EXTENT,
+    GEO_FACTOR,
+    GEO_PEAK,
+    GEO_SIZE,
+    POSE_ANTIALIAS,
+    POSE_CENTRE,
+    POSE_FAR,
+    POSE_NEAR,
+    POSE_ROTATION,
+    POSE_SHIFT,
+    POSE_TURN,
+    TILE,
+    TIME_STEPS,
+)
+from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.lens_rays import (
+    LENS_BENDS,
+    LENS_COS,
+    LENS_G,
+    LENS_HEIGHT,
+    LENS_LEAST,
+    LENS_LINEAR,
+    LENS_MARGIN,
+    LENS_MIDDLE,
+    LENS_MOST,
+    LENS_ROLLS,
+    LENS_S_MOST,
+    LENS_SIN,
+    LENS_SLOPE,
+    LENS_TIME,
+    LENS_WIDTH,
+)
+from alpasim_plugin.gaussians.raster.project_kernels import (
+    CHUNK,
+    colour_group,
+    cross,
+    dot,
+    load3,
+    row,
+)
+from alpasim_plugin.gaussians.raster.raster_kernels import CUT
+
+# A record: columns 6 to 8 are the colour; from 16 on for rolling shutters alone.
+ROW_A, ROW_B, ROW_C = 0, 3, 9
+INVERSE_O2, PEAK, DEPTH, CUT_SIGMA = 12, 13, 14, 15
+ROW_N = 16
+NODE, DISTANCE = 25, 26  # the place of its motion, -1: it stands in the world; n
+PASSED = 27  # 1: the camera may pass it, or be in it, while the shutter is open
+SHORT, LONG = 16, 32  # numbers of a record
+# further columns of the lanes in which sixteen records are made
+LEFT, RIGHT, TOP, BOTTOM, KEY = range(LONG, LONG + 5)
+COLUMNS = LONG + 5
+# Eight directions of the outline, of which four are the others turned about; a polygon around it.
+COS = np.cos(np.arange(4) * np.pi / 4)
+SIN = np.sin(np.arange(4) * np.pi / 4)
+AROUND = float(1 / np.cos(np.pi / 8))
+CLOSE = 0.95  # of (t / o)^2: the camera lies within the drawn ellipsoid, or nearly
+WIDE = 0.2  # of (half axis / distance)^2: the outline is too wide for eight directions
+LEAST_SLOPE = 0.05  # of the pixels per radian along the radius to those across
+NEAR_SHIFTS = 1.5  # nearer than so many shifts of a shutter a Gaussian is looked for everywhere
+EVERY = 1.0e9
+
+
+@kernel
+def _scaled(a, k):
+    return a[0] * k, a[1] * k, a[2] * k
+
+
+@kernel
+def _added(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@kernel
+def _polynomial(lens, first, degree, s):
+    x = v.fma(s, 2.0 / lens[LENS_S_MOST], -1.0)
+    value = v.fma(x, lens[first + degree], lens[first + degree - 1])
+    for k in range(degree - 2, -1, -1):
+        value = v.fma(value, x, lens[first + k])
+    return value
+
+
+@kernel
+def _place_on_sphere(lens, p):
+    """Return h of points, held to where the lens is described, its s and that before."""
+    n = v.sqrt(dot(p, p))
+    inverse = 1.0 / v.maximum(n + p[2], 1e-6 * n + 1e-30)
+    hx = p[0] * inverse
+    hy = p[1] * inverse
+    s = v.fma(hx, hx, hy * hy)
+    held = v.minimum(s, lens[LENS_S_MOST])
+    shrink = v.sqrt(held / v.maximum(s, 1e-30))
+    return (hx * shrink, hy * shrink), held, s
+
+
+@kernel
+def _bent(lens, x, y):
+    """Return what the tangential and thin prism terms add at tangents x, y."""
+    k = LENS_BENDS + 1
+    r2 = v.fma(x, x, y * y)
+    xy = x * y
+    radial_x = r2 * v.fma(r2, lens[k + 3], lens[k + 2])
+    radial_y = r2 * v.fma(r2, lens[k + 5], lens[k + 4])
+    bent_x = radial_x + 2.0 * lens[k] * xy + lens[k + 1] * v.fma(2.0 * x, x, r2)
+    bent_y = radial_y + lens[k] * v.fma(2.0 * y, y, r2) + 2.0 * lens[k + 1] * xy
+    return bent_x, bent_y
+
+
+@kernel
+def shown(lens, p):
+    """Return the pixels ``u, v`` at which a lens shows points, and their s."""
+    h, held, s = _place_on_sphere(lens, p)
+    g = _polynomial(lens, LENS_G, DEGREE, held)
+    x = h[0] * g
+    y = h[1] * g
+    if lens[LENS_BENDS] > 0:
+        k = 2.0 / (1.0 - held)
+        bent_x, bent_y = _bent(lens, h[0] * k, h[1] * k)
+        x = x + bent_x
+        y = y + bent_y
+    a = LENS_LINEAR
+    u = v.fma(x, lens[a], v.fma(y, lens[a + 1], lens[LENS_MIDDLE]))
+    w = v.fma(x, lens[a + 2], v.fma(y, lens[a + 3], lens[LENS_MIDDLE + 1]))
+    return u, w, s
+
+
+@kernel
+def _times_bent(lens, h, held, j):
+    """Return a Jacobian by h with that of the tangential and thin prism terms added."""
+    k = LENS_BENDS + 1
+    p1, p2 = lens[k], lens[k + 1]
+    t = 2.0 / (1.0 - held)
+    x = h[0] * t
+    y = h[1] * t
+    r2 = v.fma(x, x, y * y)
+    fx = v.fma(r2, 4.0 * lens[k + 3], 2.0 * lens[k + 2])
+    fy = v.fma(r2, 4.0 * lens[k + 5], 2.0 * lens[k + 4])
+    xx = 2.0 * p1 * y + 6.0 * p2 * x + fx * x
+    xy = 2.0 * p1 * x + 2.0 * p2 * y + fx * y
+    yx = 2.0 * p1 * x + 2.0 * p2 * y + fy * x
+    yy = 6.0 * p1 * y + 2.0 * p2 * x + fy * y
+    # of the tangents by h: t I + t^2 h h^T
+    d00 = v.fma(x, x, t)
+    d01 = x * y
+    d11 = v.fma(y, y, t)
+    return (
+        j[0] + xx * d00 + xy * d01,
+        j[1] + xx * d01 + xy * d11,
+        j[2] + yx * d00 + yy * d01,
+        j[3] + yx * d01 + yy * d11,
+    )
+
+
+@kernel
+def _pixels_per_radian(lens, h, held):
+    """Return the derivative of the pixel by the two tangents of `_tangents`, row by row."""
+    g = _polynomial(lens, LENS_G, DEGREE, held)
+    slope = 2.0 * _polynomial(lens, LENS_SLOPE, DEGREE - 1, held)
+    slope = v.maximum(slope, (LEAST_SLOPE - 1.0) * g / v.maximum(held, 1e-12))
+    mixed = slope * h[0] * h[1]
+    j = v.fma(slope * h[0], h[0], g), mixed, mixed, v.fma(slope * h[1], h[1], g)
+    if lens[LENS_BENDS] > 0:
+        j = _times_bent(lens, h, held, j)
+    a = LENS_LINEAR
+    k = v.fma(held, 0.5, 0.5)
+    return (
+        k * (lens[a] * j[0] + lens[a + 1] * j[2]),
+        k * (lens[a] * j[1] + lens[a + 1] * j[3]),
+        k * (lens[a + 2] * j[0] + lens[a + 3] * j[2]),
+        k * (lens[a + 2] * j[1] + lens[a + 3] * j[3]),
+    )
+
+
+@kernel
+def _tangents(p, n):
+    """Return two unit vectors across the directions of points, along h's axes."""
+    inverse = 1.0 / v.maximum(n + p[2], 1e-7 * n)
+    hx = p[0] * inverse
+    hy = p[1] * inverse
+    k = 2.0 / (v.fma(hx, hx, hy * hy) + 1.0)
+    mixed = v.negative(k * hx * hy)
+    right = v.fnma(k * hx, hx, 1.0), mixed, v.negative(k * hx)
+    down = mixed, v.fnma(k * hy, hy, 1.0), v.negative(k * hy)
+    return right, down
+
+
+@kernel
+def _covariance(geometry, geo, pose):
+    """Return the six numbers of the covariance of sixteen Gaussians in the camera's axes."""
+    f = geo + GEO_FACTOR * 16
+    first = _as_f64(load3(geometry, f))
+    second = _as_f64(load3(geometry, f + 48))
+    third = _as_f64(load3(geometry, f + 96))
+    x = _combined(row(pose, POSE_ROTATION), first, second, third)
+    y = _combined(row(pose, POSE_ROTATION + 3), first, second, third)
+    z = _combined(row(pose, POSE_ROTATION + 6), first, second, third)
+    return dot(x, x), dot(x, y), dot(x, z), dot(y, y), dot(y, z), dot(z, z)
+
+
+@kernel
+def _as_f64(a):
+    return v.to_f64(a[0]), v.to_f64(a[1]), v.to_f64(a[2])
+
+
+@kernel
+def _combined(weights, a, b, c):
+    return _added(_added(_scaled(a, weights[0]), _scaled(b, weights[1])), _scaled(c, weights[2]))
+
+
+@kernel
+def _times(s, a):
+    """Return a symmetric matrix times a vector."""
+    return (
+        dot((s[0], s[1], s[2]), a),
+        dot((s[1], s[3], s[4]), a),
+        dot((s[2], s[4], s[5]), a),
+    )
+
+
+@kernel
+def _with_square(s, a):
+    """Return a symmetric matrix plus ``a a^T``."""
+    return (
+        v.fma(a[0], a[0], s[0]),
+        v.fma(a[0], a[1], s[1]),
+        v.fma(a[0], a[2], s[2]),
+        v.fma(a[1], a[1], s[3]),
+        v.fma(a[1], a[2], s[4]),
+        v.fma(a[2], a[2], s[5]),
+    )
+
+
+@kernel
+def _kept_share(s, right, down, k, eps, n2):
+    """Return the share of the determinants of the covariances in the image, without and with the
+    low-pass; see Mip-Splatting.
+    """
+    sr = _times(s, right)
+    sd = _times(s, down)
+    rr = dot(sr, right)
+    rd = dot(sr, down)
+    dd = dot(sd, down)
+    inverse = 1.0 / n2
+    uu = inverse * (k[0] * k[0] * rr + 2.0 * k[0] * k[1] * rd + k[1] * k[1] * dd)
+    ww = inverse * (k[2] * k[2] * rr + 2.0 * k[2] * k[3] * rd + k[3] * k[3] * dd)
+    determinant = k[0] * k[3] - k[1] * k[2]
+    raw = v.maximum(rr * dd - rd * rd, 0.0) * (determinant * inverse) * (determinant * inverse)
+    return raw / (raw + eps * (uu + ww) + eps * eps)
+
+
+@kernel
+def _low_passed(s, p, n2, right, down, k, eps):
+    """Return the covariance with that of the pixel at the mean's place."""
+    determinant = 1.0 / (k[0] * k[3] - k[1] * k[2])
+    scale = v.sqrt(n2 * eps) * determinant
+    m00, m01 = k[3] * scale, v.negative(k[1] * scale)
+    m10, m11 = v.negative(k[2] * scale), k[0] * scale
+    s = _with_square(s, _added(_scaled(right, m00), _scaled(down, m10)))
+    s = _with_square(s, _added(_scaled(right, m01), _scaled(down, m11)))
+    size = v.sqrt(0.5 * (m00 * m00 + m01 * m01 + m10 * m10 + m11 * m11) / n2)
+    return _with_square(s, _scaled(p, size))
+
+
+@kernel
+def _cholesky(s):
+    """Return L of S = L L^T, six numbers row by row, and the inverses of its diagonal."""
+    l11 = v.sqrt(s[0])
+    i1 = 1.0 / l11
+    l21 = s[1] * i1
+    l31 = s[2] * i1
+    l22 = v.sqrt(v.maximum(v.fnma(l21, l21, s[3]), 1e-14 * s[3]))
+    i2 = 1.0 / l22
+    l32 = v.fnma(l31, l21, s[4]) * i2
+    l33 = v.sqrt(v.maximum(v.fnma(l32, l32, v.fnma(l31, l31, s[5])), 1e-14 * s[5]))
+    return (l11, l21, l22, l31, l32, l33), (i1, i2, 1.0 / l33)
+
+
+@kernel
+def _solved(lower, inverses, p):
+    """Return L^-1 p."""
+    x = p[0] * inverses[0]
+    y = v.fnma(lower[1], x, p[1]) * inverses[1]
+    z = v.fnma(lower[4], y, v.fnma(lower[3], x, p[2])) * inverses[2]
+    return x, y, z
+
+
+@kernel
+def _row_solved(lower, inverses, q, k):
+    """Return ``k q L^-1``."""
+    z = q[2] * inverses[2]
+    y = v.fnma(lower[4], z, q[1]) * inverses[1]
+    x = v.fnma(lower[3], z, v.fnma(lower[1], y, q[0])) * inverses[0]
+    return _scaled((x, y, z), k)
+
+
+@kernel
+def _spread(lower, q):
+    """Return L q."""
+    return (
+        lower[0] * q[0],
+        v.fma(lower[1], q[0], lower[2] * q[1]),
+        v.fma(lower[3], q[0], v.fma(lower[4], q[1], lower[5] * q[2])),
+    )
+
+
+@kernel
+def _basis(w):
+    """Return two unit vectors across a unit vector and each other (Duff et al., Building an
+    Orthonormal Basis, Revisited, 2017).
+    """
+    zero = w[2] * 0.0
+    sign = v.select(w[2] >= 0.0, zero + 1.0, zero - 1.0)
+    a = -1.0 / (sign + w[2])
+    b = w[0] * w[1] * a
+    first = v.fma(sign * w[0], w[0] * a, 1.0), sign * b, v.negative(sign * w[0])
+    return first, (b, v.fma(w[1], w[1] * a, sign), v.negative(w[1]))
+
+
+@kernel
+def _at_its_time(p, pose, lens):
+    """Return where points are, in camera axes, when the row that shows them is exposed."""
+    shift = row(pose, POSE_SHIFT)
+    turn = row(pose, POSE_TURN)
+    turned = cross(turn, p)
+    first = turned[0] + shift[0], turned[1] + shift[1], turned[2] + shift[2]
+    second = _scaled(cross(turn, first), 0.5)
+    place = p
+    for _ in range(TIME_STEPS):
+        u, w, _ = shown(lens, place)
+        time = v.fma(u, lens[LENS_TIME], v.fma(w, lens[LENS_TIME + 1], lens[LENS_TIME + 2]))
+        time = v.minimum(v.maximum(time, -0.5), 0.5)
+        place = (
+            v.fma(time, v.fma(time, second[0], first[0]), p[0]),
+            v.fma(time, v.fma(time, second[1], first[1]), p[1]),
+            v.fma(time, v.fma(time, second[2], first[2]), p[2]),
+        )
+    return place
+
+
+@kernel
+def _write_box(lanes, lens, place, n, first, second, moves):
+    """Write the boxes of the outlines ``place + cos first + sin second``; returns the bits of those
+    that are in the image, and of those to be looked for everywhere.
+
+    An outline between its eight directions bends by no more than its middle misses the mean.
+    """
+    mean = v.to_f32(place[0]), v.to_f32(place[1]), v.to_f32(place[2])
+    a = v.to_f32(first[0]), v.to_f32(first[1]), v.to_f32(first[2])
+    b = v.to_f32(second[0]), v.to_f32(second[1]), v.to_f32(second[2])
+    u, w, s = shown(lens, mean)
+    left, right, top, bottom = u, u, w, w
+    bend_u, bend_w = v.absolute(u * 0.0), v.absolute(u * 0.0)
+    for k in range(4):
+        step = _added(_scaled(a, COS[k]), _scaled(b, SIN[k]))
+        u1, w1, s1 = shown(lens, _added(mean, step))
+        u2, w2, s2 = shown(lens, _added(mean, _scaled(step, -1.0)))
+        left = v.minimum(left, v.minimum(u1, u2))
+        right = v.maximum(right, v.maximum(u1, u2))
+        top = v.minimum(top, v.minimum(w1, w2))
+        bottom = v.maximum(bottom, v.maximum(w1, w2))
+        bend_u = v.maximum(bend_u, v.absolute(0.5 * (u1 + u2) - u))
+        bend_w = v.maximum(bend_w, v.absolute(0.5 * (w1 + w2) - w))
+        s = v.maximum(s, v.maximum(s1, s2))
+    more_u = bend_u + lens[LENS_MARGIN]
+    more_w = bend_w + lens[LENS_MARGIN]
+    everywhere = v.bits(s >= lens[LENS_S_MOST])
+    if lens[LENS_ROLLS] > 0:
+        # What the time at the box's ends moves it by, and what coming nearer changes of its size.
+        parallax = v.to_f32(0.5 * moves[1] / n)
+        rate = abs(lens[LENS_TIME]) * (right - left) + abs(lens[LENS_TIME + 1]) * (bottom - top)
+        late = rate * (2.0 * parallax + moves[0]) * (2.0 * lens[LENS_MOST])
+        more_u = more_u + late + 1.5 * parallax * (right - left) + 0.1
+        more_w = more_w + late + 1.5 * parallax * (bottom - top) + 0.1
+        everywhere |= v.bits(n < NEAR_SHIFTS * moves[1])
+    left, right, top, bottom = left - more_u, right + more_u, top - more_w, bottom + more_w
+    v.store(lanes, LEFT * 16, left)
+    v.store(lanes, RIGHT * 16, right)
+    v.store(lanes, TOP * 16, top)
+    v.store(lanes, BOTTOM * 16, bottom)
+    in_columns = (right >= 0.5) & (left <= lens[LENS_WIDTH] - 0.5)
+    in_rows = (bottom >= 0.5) & (top <= lens[LENS_HEIGHT] - 0.5)
+    return v.bits(in_columns & in_rows), everywhere
+
+
+@kernel
+def _store3(lanes, column, a):
+    for k in range(3):
+        v.store(lanes, (column + k) * 16, v.to_f32(a[k]))
+
+
+@kernel
+def _in_cone(p, reach, lens):
+    """Return which points may lie no farther than ``reach`` outside the cone that the image shows."""
+    across = v.sqrt(v.fma(p[0], p[0], p[1] * p[1]))
+    return across * lens[LENS_COS] - p[2] * lens[LENS_SIN] <= reach
+
+
+@kernel
+def _size(geometry, geo):
+    """Return a bound of the largest standard deviation."""
+    total = v.load(geometry, geo + GEO_FACTOR * 16) * 0.0
+    for k in range(9):
+        part = v.load(geometry, geo + (GEO_FACTOR + k) * 16)
+        total = v.fma(part, part, total)
+    return v.to_f64(v.sqrt(total))
+
+
+@kernel
+def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves):
+    """Write the rows and boxes of Gaussians; returns the bits of those that reach the image."""
+    antialias = pose[POSE_ANTIALIAS]
+    eps = antialias if antialias > 0 else EPS2D_PX2
+    t = v.to_f64(v.load(geometry, geo + GEO_EXTENT * 16))
+    at_n2 = dot(place, place)
+    at_n = v.sqrt(at_n2)
+    h, held, _ = _place_on_sphere(lens, place)
+    k = _pixels_per_radian(lens, h, held)
+    right, down = _tangents(place, at_n)
+    s = _covariance(geometry, geo, pose)
+    peak = v.load(geometry, geo + GEO_PEAK * 16)
+    chosen = v.bits(mask)
+    if antialias > 0:
+        v.store(lanes, PEAK * 16, v.to_f32(_kept_share(s, right, down, k, eps, at_n2)))
+        for lane in range(PEAK * 16, PEAK * 16 + 16):
+            lanes[lane] = np.log2(lanes[lane]) / 16
+        peak = peak + v.load(lanes, PEAK * 16)
+        chosen &= v.bits(peak >= CUT)
+    s = _low_passed(s, place, at_n2, right, down, k, eps)
+    lower, inverses = _cholesky(s)
+    w = _solved(lower, inverses, p)
+    o2 = dot(w, w)
+    inverse_o = 1.0 / v.sqrt(o2)
+    w = _scaled(w, inverse_o)
+    q1, q2 = _basis(w)
+    first = _spread(lower, q1)
+    second = _spread(lower, q2)
+    ratio = t * t / o2
+    out = AROUND * t / v.sqrt(v.maximum(1.0 - ratio, 1.0 - CLOSE))
+    size2 = v.maximum(dot(first, first), dot(second, second)) * out * out
+    boxed = _write_box(lanes, lens, place, n, _scaled(first, out), _scaled(second, out), moves)
+    everywhere = boxed[1] | v.bits(ratio >= CLOSE) | v.bits(size2 > WIDE * n * n)
+    if lens[LENS_ROLLS] > 0:
+        everywhere |= _write_passed(lanes, lower, inverses, pose, v.sqrt(o2), t)
+    chosen &= boxed[0] | everywhere
+    if chosen == 0:
+        return 0
+    _list_everywhere(lanes, everywhere)
+    _store3(lanes, ROW_A, _row_solved(lower, inverses, q1, n))
+    _store3(lanes, ROW_B, _row_solved(lower, inverses, q2, n))
+    _store3(lanes, ROW_C, _row_solved(lower, inverses, w, n * inverse_o))
+    v.store(lanes, INVERSE_O2 * 16, v.to_f32(1.0 / o2))
+    v.store(lanes, PEAK * 16, peak)
+    v.store(lanes, DEPTH * 16, v.to_f32(at_n))
+    v.store(lanes, CUT_SIGMA * 16, v.to_f32(t))
+    if lens[LENS_ROLLS] > 0:
+        scale = n * inverse_o * inverses[0] * inverses[1] * inverses[2]
+        _store3(lanes, ROW_N, _scaled(first, scale))
+        _store3(lanes, ROW_N + 3, _scaled(second, scale))
+        _store3(lanes, ROW_N + 6, _scaled(p, scale * inverse_o))
+        v.store(lanes, DISTANCE * 16, v.to_f32(n))
+    return chosen
+
+
+@kernel
+def _write_passed(lanes, lower, inverses, pose, o, t):
+    """Write which Gaussians the camera may pass, or be in, while it moves by half a shift to both
+    sides; returns their bits.
+    """
+    moved = _whitened_length(lower, inverses, row(pose, POSE_SHIFT), o)
+    passed = v.bits(o - moved < v.maximum(2.0 * t, 0.5 * o))
+    for lane in range(16):
+        lanes[PASSED * 16 + lane] = passed >> lane & 1
+    return passed
+
+
+@kernel
+def _whitened_length(lower, inverses, shift, like):
+    """Return the length of a little more than half of L^-1 times a shift."""
+    zero = like * 0.0
+    x, y, z = _solved(lower, inverses, (zero + shift[0], zero + shift[1], zero + shift[2]))
+    return 0.55 * v.sqrt(dot((x, y, z), (x, y, z)))
+
+
+@kernel
+def _list_everywhere(lanes, everywhere):
+    """Let boxes hold the whole image."""
+    while everywhere != 0:
+        lane = v.lowest_bit(everywhere)
+        everywhere &= everywhere - 1
+        lanes[LEFT * 16 + lane] = -EVERY
+        lanes[RIGHT * 16 + lane] = EVERY
+        lanes[TOP * 16 + lane] = -EVERY
+        lanes[BOTTOM * 16 + lane] = EVERY
+
+
+@kernel
+def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, lanes):
+    """Project sixteen Gaussians into ``lanes`` and return the bit mask of those that reach the
+    image.
+    """
+    x, y, z = load3(means, group * 48)
+    d = x - pose[POSE_CENTRE], y - pose[POSE_CENTRE + 1], z - pose[POSE_CENTRE + 2]
+    p = (
+        dot(row(pose, POSE_ROTATION), d),
+        dot(row(pose, POSE_ROTATION + 3), d),
+        dot(row(pose, POSE_ROTATION + 6), d),
+    )
+    n = v.sqrt(dot(p, p))
+    geo = group * (GEO_SIZE * 16)
+    t = v.to_f64(v.load(geometry, geo + GEO_EXTENT * 16))
+    low_pass = 1.5 * np.sqrt(max(pose[POSE_ANTIALIAS], EPS2D_PX2)) / lens[LENS_LEAST]
+    reach = t * v.fma(n, low_pass, _size(geometry, geo))
+    reach = reach + 0.5 * v.fma(n, moves[0], moves[1])
+    mask = (n >= pose[POSE_NEAR]) & (n <= pose[POSE_FAR]) & _in_cone(p, reach, lens)
+    if v.bits(mask) == 0:
+        return 0
+    place = p
+    if lens[LENS_ROLLS] > 0:
+        place = _at_its_time(p, pose, lens)
+    chosen = _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves)
+    if chosen != 0:
+        largest = v.maximum(v.maximum(v.absolute(p[0]), v.absolute(p[1])), v.absolute(p[2]))
+        v.store(lanes, KEY * 16, v.to_f32(largest))
+        d32 = v.to_f32(d[0]), v.to_f32(d[1]), v.to_f32(d[2])
+        colour_group(group, d32, sh, sh_size, lanes)
+    return chosen
+
+
+@kernel
+def _tile_number(place, n_tiles):
+    """Return the tile of a place in pixels, held to 0..n_tiles; rounded down."""
+    return np.int16(min(max(place / TILE, 0.0), np.float64(n_tiles)))
+
+
+@kernel
+def project_lens_part(
+    cursor,
+    part,
+    means,
+    geometry,
+    sh,
+    sh_size,
+    index,
+    first_id,
+    pose,
+    node,
+    lens,
+    size,
+    records,
+    boxes,
+    keys,
+    ids,
+):
+    """Project the Gaussians of one part and append those that reach the image; called by each
+    thread, which takes bundles until none is left.
+
+    Args:
+        cursor, part, means, geometry, sh, sh_size, index, first_id, pose: See
+            `project_kernels.project_part`.
+        node: Place of the part's motion, -1: it stands in the world.
+        lens: float64 ``(LENS_SIZE,)``.
+        size: Numbers of a record.
+        records: float32 output, ``size`` per splat.
+        boxes: int16 output ``(N, 4)``: see `binning.tile_boxes`.
+        keys: float32 output: what the order of drawing follows.
+        ids: int64 output.
+    """
+    lanes = np.zeros(COLUMNS * 16, dtype=np.float32)
+    turn = row(pose, POSE_TURN)
+    shift = row(pose, POSE_SHIFT)
+    # By how many radians and metres things move in a shutter.
+    moves = (
+        np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2),
+        np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2),
+    )
+    tiles_x = -(-int(lens[LENS_WIDTH]) // TILE)
+    tiles_y = -(-int(lens[LENS_HEIGHT]) // TILE)
+    groups = index.shape[0] // 16
+    for lane in range(16):
+        lanes[NODE * 16 + lane] = node
+    while True:
+        begin = v.fetch_add(cursor, part + 1, CHUNK)
+        if begin >= groups:
+            return
+        for group in range(begin, min(begin + CHUNK, groups)):
+            chosen = _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, lanes)
+            if chosen == 0:
+                continue
+            count = 0
+            remaining = chosen
+            while remaining != 0:
+                remaining &= remaining - 1
+                count += 1
+            out = v.fetch_add(cursor, 0, count)
+            while chosen != 0:
+                lane = v.lowest_bit(chosen)
+                chosen &= chosen - 1
+                for column in range(size):
+                    records[out * size + column] = lanes[column * 16 + lane]
+                boxes[out, 0] = _tile_number(lanes[LEFT * 16 + lane] - 0.5, tiles_x)
+                boxes[out, 1] = _tile_number(lanes[RIGHT * 16 + lane] - 0.5 + TILE, tiles_x)
+                boxes[out, 2] = _tile_number(lanes[TOP * 16 + lane] - 0.5, tiles_y)
+                boxes[out, 3] = _tile_number(lanes[BOTTOM * 16 + lane] - 0.5 + TILE, tiles_y)
+                keys[out] = lanes[KEY * 16 + lane]
+                ids[out] = index[group * 16 + lane] + first_id
+                out += 1

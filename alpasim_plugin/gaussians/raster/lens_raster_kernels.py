@@ -1,0 +1,479 @@
+"""Composite the splats of each tile along the rays of a lens, sixteen pixels at a time: the scheme of
+`raster_kernels` with the records of `lens_project_kernels`.
+
+Of a rolling shutter each pixel looks from where the camera is at its time. A record is that of the
+shutter's middle; a ray is turned and shifted to there: by the camera's motion once per pixel, for
+Gaussians of a moving road user by its own once more.
+"""
+
+# Numba's decorators and vector types are untyped.
+# mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
+
+import numpy as np
+
+from alpasim_plugin.core.kernels import kernel
+from alpasim_plugin.gaussians.constants import (
+    ALPHA_MAX,
+    EXPONENT_SCALE,
+    TILE,
+    TRANSMITTANCE_STOP,
+    B,
+    G,
+    R,
+)
+from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.lens_project_kernels import (
+    CLOSE,
+    CUT_SIGMA,
+    DEPTH,
+    DISTANCE,
+    INVERSE_O2,
+    LONG,
+    NODE,
+    PASSED,
+    PEAK,
+    ROW_A,
+    ROW_B,
+    ROW_C,
+    ROW_N,
+    SHORT,
+)
+from alpasim_plugin.gaussians.raster.lens_rays import (
+    BLOCK_ROWS,
+    LENS_SHIFT,
+    LENS_TIME,
+    LENS_TURN,
+    MOTION,
+    MOTION_BOUND_D,
+    MOTION_BOUND_M,
+    MOTION_CENTRE,
+    MOTION_SPEED,
+    MOTION_TURN,
+)
+from alpasim_plugin.gaussians.raster.project_kernels import cross, dot, load3, row
+from alpasim_plugin.gaussians.raster.raster_kernels import (
+    CHUNK,
+    CUT,
+    STATE,
+    STATE_B,
+    STATE_D,
+    STATE_G,
+    STATE_R,
+    STATE_T,
+    block_centres,
+    falloff,
+)
+
+_f = np.float32
+Q2_SCALE = _f(EXPONENT_SCALE**2)
+TINY = _f(1e-30)
+# Per block of a rolling shutter's tile: direction, moment and time of sixteen pixels.
+ROLLED_D, ROLLED_M, ROLLED_TIME, ROLLED = 0, 48, 96, 112
+# Per tile: mean, change to the right and down of directions and moments, then what they miss.
+BLOCKS_M, MISSED_D, MISSED_M, BLOCKS = 144, 288, 304, 320
+ALL_BLOCKS = 0xFFFF
+ROUNDING = _f(1e-3)  # of standard deviations
+
+
+@kernel
+def _turned(d, turn, time):
+    """Return vectors turned by ``time turn``, to second order."""
+    first = cross(turn, d)
+    second = cross(turn, first)
+    half = _f(0.5) * time * time
+    return (
+        v.fma(half, second[0], v.fma(time, first[0], d[0])),
+        v.fma(half, second[1], v.fma(time, first[1], d[1])),
+        v.fma(half, second[2], v.fma(time, first[2], d[2])),
+    )
+
+
+@kernel
+def _time(lens, x, y):
+    """Return when pixels are exposed, in shutters from the middle."""
+    time = v.fma(x, lens[LENS_TIME], v.fma(y, lens[LENS_TIME + 1], lens[LENS_TIME + 2]))
+    return v.minimum(v.maximum(time, -0.5), 0.5)
+
+
+@kernel
+def _times(a, k):
+    return a[0] * k, a[1] * k, a[2] * k
+
+
+@kernel
+def _store3(array, offset, a):
+    v.store(array, offset, a[0])
+    v.store(array, offset + 16, a[1])
+    v.store(array, offset + 32, a[2])
+
+
+@kernel
+def _roll_pixels(rays, place, x, y, lens, rolled, block):
+    """Write direction, moment and time of a block's pixels."""
+    time = _time(lens, x, y)
+    turn = row(lens, LENS_TURN)
+    shift = row(lens, LENS_SHIFT)
+    d = _turned(load3(rays, place), turn, time)
+    base = block * ROLLED
+    _store3(rolled, base + ROLLED_D, d)
+    _store3(rolled, base + ROLLED_M, _times(cross(shift, d), time))
+    v.store(rolled, base + ROLLED_TIME, time)
+
+
+@kernel
+def _roll_blocks(blocks, place, x0, y0, lens, out):
+    """Write how directions and moments vary over a tile's blocks; ``x0, y0`` is the centre of its
+    first pixel.
+    """
+    turn = row(lens, LENS_TURN)
+    shift = row(lens, LENS_SHIFT)
+    mean, right, down = load3(blocks, place), load3(blocks, place + 48), load3(blocks, place + 96)
+    x = v.lane_pattern(_f(4.0), _f(0.0)) + x0
+    y = v.lane_pattern(_f(0.0), _f(4.0)) + y0
+    zero = x * _f(0.0)
+    for k in range(18):
+        v.store(out, k * 16, zero)
+    quarter = _f(0.25)
+    for corner in range(4):
+        to_right = _f(2 * (corner & 1) - 1)
+        to_down = _f((corner & 2) - 1)
+        d = (
+            v.fma(right[0], to_right, v.fma(down[0], to_down, mean[0])),
+            v.fma(right[1], to_right, v.fma(down[1], to_down, mean[1])),
+            v.fma(right[2], to_right, v.fma(down[2], to_down, mean[2])),
+        )
+        time = _time(lens, x + (to_right + _f(1.0)) * _f(1.5), y + (to_down + _f(1.0)) * _f(1.5))
+        d = _turned(d, turn, time)
+        m = _times(cross(shift, d), time)
+        for k in range(3):
+            for first, value in ((k * 16, d[k]), (BLOCKS_M + k * 16, m[k])):
+                v.store(out, first, v.fma(quarter, value, v.load(out, first)))
+                change = v.fma(quarter * to_right, value, v.load(out, first + 48))
+                v.store(out, first + 48, change)
+                change = v.fma(quarter * to_down, value, v.load(out, first + 96))
+                v.store(out, first + 96, change)
+    # What a product of the time's and the ray's change adds.
+    later = _f(3.0 * (abs(lens[LENS_TIME]) + abs(lens[LENS_TIME + 1])))
+    turned = later * _f(np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2))
+    moved = _f(np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2))
+    change = v.sqrt(dot(right, right)) + v.sqrt(dot(down, down))
+    missed = v.load(blocks, place + 144) + turned * (change + turned)
+    v.store(out, MISSED_D, missed)
+    v.store(out, MISSED_M, moved * (_f(0.5) * missed + later * (change + turned)))
+
+
+@kernel
+def _vary(records, place, blocks, offset):
+    """Return the mean of a row's products with the rays of each block, and its changes to the right
+    and down.
+    """
+    a = row(records, place)
+    return (
+        dot(a, load3(blocks, offset)),
+        dot(a, load3(blocks, offset + 48)),
+        dot(a, load3(blocks, offset + 96)),
+    )
+
+
+@kernel
+def _length(records, first, end):
+    total = _f(0.0)
+    for k in range(first, end):
+        total += records[k] * records[k]
+    return np.sqrt(total)
+
+
+@kernel
+def _touched(records, place, blocks, offset, motion):
+    """Return the bit mask of a tile's blocks that a Gaussian can touch."""
+    t2 = records[place + CUT_SIGMA] * records[place + CUT_SIGMA]
+    if records[place + INVERSE_O2] * t2 >= _f(CLOSE):
+        return ALL_BLOCKS
+    if motion is not None and records[place + PASSED] > 0:
+        return ALL_BLOCKS
+    a, a_right, a_down = _vary(records, place + ROW_A, blocks, offset)
+    b, b_right, b_down = _vary(records, place + ROW_B, blocks, offset)
+    c, c_right, c_down = _vary(records, place + ROW_C, blocks, offset)
+    size = np.sqrt(
+        _length(records, place + ROW_A, place + ROW_A + 6) ** 2
+        + _length(records, place + ROW_C, place + ROW_C + 3) ** 2
+    )
+    missed = v.load(blocks, offset + (MISSED_D if motion is not None else 144))
+    if motion is not None and records[place + NODE] >= 0:
+        node = np.int64(records[place + NODE]) * MOTION
+        missed = missed + motion[node + MOTION_BOUND_D]
+    extra = size * missed + ROUNDING
+    change_a = v.absolute(a_right) + v.absolute(a_down)
+    change_b = v.absolute(b_right) + v.absolute(b_down)
+    off_axis = v.sqrt(v.fma(a, a, b * b))
+    change = v.sqrt(v.fma(change_a, change_a, change_b * change_b)) + extra
+    most = off_axis + change
+    ahead = c + v.absolute(c_right) + v.absolute(c_down) + extra
+    if motion is not None:
+        n1, n1_right, n1_down = _vary(records, place + ROW_N, blocks, offset + BLOCKS_M)
+        n2, n2_right, n2_down = _vary(records, place + ROW_N + 3, blocks, offset + BLOCKS_M)
+        x = b + n1
+        y = n2 - a
+        off_axis = v.sqrt(v.fma(x, x, y * y))
+        change_x = v.absolute(b_right + n1_right) + v.absolute(b_down + n1_down)
+        change_y = v.absolute(n2_right - a_right) + v.absolute(n2_down - a_down)
+        missed_m = v.load(blocks, offset + MISSED_M)
+        if records[place + NODE] >= 0:
+            missed_m = missed_m + motion[np.int64(records[place + NODE]) * MOTION + MOTION_BOUND_M]
+        change = v.sqrt(v.fma(change_x, change_x, change_y * change_y)) + extra
+        change = change + _length(records, place + ROW_N, place + ROW_N + 6) * missed_m
+    least = v.maximum(off_axis - change, _f(0.0))
+    below = v.fma(most * most, records[place + INVERSE_O2], ahead * ahead)
+    return v.bits((least * least <= _f(1.0001) * t2 * below) & (ahead > _f(0.0)))
+
+
+@kernel
+def _as_if_still(motion, node, d, o, time):
+    """Return the ray that meets a moving road user at the shutter's middle as a ray does at its
+    time: direction and start.
+    """
+    turn = row(motion, node + MOTION_TURN)
+    speed = row(motion, node + MOTION_SPEED)
+    centre = row(motion, node + MOTION_CENTRE)
+    back = v.negative(time)
+    from_centre = (
+        v.fma(back, speed[0], o[0] - centre[0]),
+        v.fma(back, speed[1], o[1] - centre[1]),
+        v.fma(back, speed[2], o[2] - centre[2]),
+    )
+    start = _turned(from_centre, turn, back)
+    start = start[0] + centre[0], start[1] + centre[1], start[2] + centre[2]
+    return _turned(d, turn, back), start
+
+
+@kernel
+def _from_start(near, place, a, b, c, o):
+    """Return for rays that start at ``o``, of a Gaussian near by, how far ahead of it the peak lies,
+    in no unit, and q^2 there.
+    """
+    inverse_n = _f(1.0) / near[place + DISTANCE]
+    middle = _f(1.0) / np.sqrt(near[place + INVERSE_O2])
+    x = dot(row(near, place + ROW_A), o) * inverse_n
+    y = dot(row(near, place + ROW_B), o) * inverse_n
+    z = v.fnma(dot(row(near, place + ROW_C), o), middle * inverse_n, middle)
+    ahead = v.fnma(x, a, v.fnma(y, b, z * (c * middle)))
+    return ahead, v.fma(x, x, v.fma(y, y, z * z))
+
+
+@kernel
+def _rolled_q2(near, place, d, m, time, shift, motion):
+    """Return q^2 on the rays of a rolling shutter."""
+    o = time * shift[0], time * shift[1], time * shift[2]
+    if near[place + NODE] >= 0:
+        d, o = _as_if_still(motion, np.int64(near[place + NODE]) * MOTION, d, o, time)
+        m = cross(o, d)
+    a = dot(row(near, place + ROW_A), d)
+    b = dot(row(near, place + ROW_B), d)
+    c = dot(row(near, place + ROW_C), d)
+    x = b + dot(row(near, place + ROW_N), m)
+    y = dot(row(near, place + ROW_N + 3), m) - a
+    z = dot(row(near, place + ROW_N + 6), m)
+    top = v.fma(x, x, v.fma(y, y, z * z))
+    across = v.maximum(v.fma(a, a, b * b), TINY) * near[place + INVERSE_O2]
+    if near[place + PASSED] > 0:
+        ahead, start = _from_start(near, place, a, b, c, o)
+        return v.select(ahead > _f(0.0), top / v.fma(c, c, across), start)
+    c = v.maximum(c, _f(0.0))
+    return top / v.fma(c, c, across)
+
+
+@kernel
+def _q2(near, place, d):
+    """Return q^2 on rays from the camera's centre."""
+    a = dot(row(near, place + ROW_A), d)
+    b = dot(row(near, place + ROW_B), d)
+    ahead = v.maximum(dot(row(near, place + ROW_C), d), _f(0.0))
+    across = v.maximum(v.fma(a, a, b * b), TINY)
+    return across / v.fma(ahead, ahead, across * near[place + INVERSE_O2])
+
+
+@kernel
+def _blend_block(block, rays, at_rays, rolled, lens, motion, masks, near, size, state):
+    """Blend the splats of a chunk that touch a block; returns whether its pixels are finished."""
+    base = block * STATE
+    through = v.load(state, base + STATE_T)
+    red = v.load(state, base + STATE_R)
+    green = v.load(state, base + STATE_G)
+    blue = v.load(state, base + STATE_B)
+    depth = v.load(state, base + STATE_D)
+    if motion is not None:
+        d = load3(rolled, block * ROLLED + ROLLED_D)
+        m = load3(rolled, block * ROLLED + ROLLED_M)
+        time = v.load(rolled, block * ROLLED + ROLLED_TIME)
+        shift = row(lens, LENS_SHIFT)
+    else:
+        d = load3(rays, at_rays)
+    finished = False
+    for word in range(CHUNK // 64):
+        touching = 0
+        for part in range(4):
+            touching |= v.bits(v.has_bit(v.load(masks, word * 64 + part * 16), block)) << (
+                part * 16
+            )
+        while touching != 0:
+            place = (word * 64 + v.lowest_bit(touching)) * size
+            touching &= touching - 1
+            if motion is not None:
+                q2 = _rolled_q2(near, place, d, m, time, shift, motion)
+            else:
+                q2 = _q2(near, place, d)
+            exponent = v.fnma(q2, Q2_SCALE, near[place + PEAK])
+            alpha = v.minimum(falloff(exponent), ALPHA_MAX)
+            alpha = v.select(exponent >= CUT, alpha, 0.0)
+            after = v.fnma(through, alpha, through)
+            goes_on = after > TRANSMITTANCE_STOP
+            weight = v.select(goes_on, through * alpha, 0.0)
+            through = v.select(goes_on, after, v.negative(v.absolute(through)))
+            red = v.fma(weight, near[place + R], red)
+            green = v.fma(weight, near[place + G], green)
+            blue = v.fma(weight, near[place + B], blue)
+            depth = v.fma(weight, near[place + DEPTH], depth)
+            if v.bits(through > 0.0) == 0:
+                finished = True
+                touching = 0
+        if finished:
+            break
+    v.store(state, base + STATE_T, through)
+    v.store(state, base + STATE_R, red)
+    v.store(state, base + STATE_G, green)
+    v.store(state, base + STATE_B, blue)
+    v.store(state, base + STATE_D, depth)
+    return finished
+
+
+@kernel
+def _start_tile(tile, alive, state):
+    """Reset the state of a tile and return the bit mask of blocks where the lens sees anything."""
+    live = 0
+    zero = v.splat(_f(0.0))
+    for block in range(16):
+        base = block * STATE
+        sight = v.load(alive, (tile * 16 + block) * 16)
+        v.store(state, base + STATE_T, sight)
+        v.store(state, base + STATE_R, zero)
+        v.store(state, base + STATE_G, zero)
+        v.store(state, base + STATE_B, zero)
+        v.store(state, base + STATE_D, zero)
+        if v.bits(sight > 0.0) != 0:
+            live |= 1 << block
+    return live
+
+
+@kernel
+def _composite_tile(
+    lists, start, end, records, rays, at_rays, blocks, at_blocks, rolled, lens, motion, live, room
+):
+    """Blend a tile's splats in order; ``room`` is the state, and that for a chunk of splats: their
+    records, and which blocks they touch.
+    """
+    state, near, masks = room
+    size = LONG if motion is not None else SHORT
+    for first in range(start, end, CHUNK):
+        if live == 0:
+            return
+        count = min(CHUNK, end - first)
+        for i in range(count):
+            v.prefetch(records, np.int64(lists[min(first + i + 16, end - 1)]) * size)
+            place = np.int64(lists[first + i]) * size
+            masks[i] = _touched(records, place, blocks, at_blocks, motion)
+            if masks[i] & live:
+                v.store(near, i * size, v.load(records, place))
+                if motion is not None:
+                    v.store(near, i * size + 16, v.load(records, place + 16))
+        for i in range(count, CHUNK):
+            masks[i] = 0
+        todo = live
+        while todo != 0:
+            block = v.lowest_bit(todo)
+            todo &= todo - 1
+            place = at_rays + block * 48
+            if _blend_block(block, rays, place, rolled, lens, motion, masks, near, size, state):
+                live &= ~(1 << block)
+
+
+@kernel
+def _write_tile(tile_x, tile_y, state, alive, at_alive, behind, colour, alpha, depth_sum):
+    """Write a tile's pixels; those in which the lens sees nothing are black and opaque."""
+    height, width = alpha.shape
+    for line in range(min(TILE, height - tile_y * TILE)):
+        y = tile_y * TILE + line
+        for column in range(min(TILE, width - tile_x * TILE)):
+            x = tile_x * TILE + column
+            block = (line >> 2) * 4 + (column >> 2)
+            pixel = (line & 3) * 4 + (column & 3)
+            if alive[at_alive + block * 16 + pixel] < 0:
+                alpha[y, x] = _f(1.0)
+                depth_sum[y, x] = _f(0.0)
+                colour[y, x, 0] = colour[y, x, 1] = colour[y, x, 2] = _f(0.0)
+                continue
+            place = block * STATE + pixel
+            opacity = _f(1.0) - abs(state[place + STATE_T])
+            alpha[y, x] = opacity
+            depth_sum[y, x] = state[place + STATE_D] / opacity if opacity > 0 else _f(0.0)
+            for channel in range(3):
+                back = behind[min(y, behind.shape[0] - 1), min(x, behind.shape[1] - 1), channel]
+                light = state[place + STATE_R + 16 * channel] + (_f(1.0) - opacity) * back
+                colour[y, x, channel] = min(max(light, _f(0.0)), _f(1.0))
+
+
+@kernel
+def composite_lens_tiles(
+    cursor,
+    tiles_x,
+    starts,
+    lists,
+    records,
+    rays,
+    alive,
+    blocks,
+    lens,
+    motion,
+    behind,
+    colour,
+    alpha,
+    depth,
+):
+    """Render tiles until none is left; called by each thread.
+
+    Args:
+        cursor, tiles_x, starts, lists: See `raster_kernels.composite_tiles`.
+        records: Of `lens_project_kernels`, `LONG` numbers each of a rolling shutter, else `SHORT`.
+        rays, alive, blocks: See `lens_rays.TileRays`.
+        lens: float64 ``(LENS_SIZE,)``.
+        motion: float32, `MOTION` numbers a moving node; None: the shutter is global.
+        behind: float32 ``(H, W, 3)`` or ``(1, 1, 3)``, the background.
+        colour: float32 output ``(H, W, 3)``, 0..1.
+        alpha: float32 output ``(H, W)``.
+        depth: float32 output ``(H, W)``, mean distance of the Gaussians' means, metres.
+    """
+    near = np.empty(CHUNK * (LONG if motion is not None else SHORT), dtype=np.float32)
+    room = np.empty(16 * STATE, dtype=np.float32), near, np.empty(CHUNK, dtype=np.int32)
+    rolled = np.empty(16 * ROLLED, dtype=np.float32)
+    rolled_blocks = np.empty(BLOCKS, dtype=np.float32)
+    while True:
+        tile = v.fetch_add(cursor, 0, 1)
+        if tile >= starts.shape[0] - 1:
+            return
+        tile_x = tile % tiles_x
+        tile_y = tile // tiles_x
+        live = _start_tile(tile, alive, room[0])
+        at_rays = tile * 16 * 48
+        at_blocks = tile * BLOCK_ROWS * 16
+        span = lists, starts[tile], starts[tile + 1], records, rays, at_rays
+        if motion is not None:
+            x0 = _f(tile_x * TILE) + _f(0.5)
+            y0 = _f(tile_y * TILE) + _f(0.5)
+            _roll_blocks(blocks, at_blocks, x0, y0, lens, rolled_blocks)
+            for block in range(16):
+                x, y = block_centres(x0, y0, block)
+                _roll_pixels(rays, at_rays + block * 48, x, y, lens, rolled, block)
+            _composite_tile(*span, rolled_blocks, 0, rolled, lens, motion, live, room)
+        else:
+            _composite_tile(*span, blocks, at_blocks, rolled, lens, motion, live, room)
+        at_alive = tile * 256
+        _write_tile(tile_x, tile_y, room[0], alive, at_alive, behind, colour, alpha, depth)

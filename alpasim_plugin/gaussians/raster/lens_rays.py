@@ -1,0 +1,165 @@
+"""The rays of a lens and the numbers of a camera with one, as the CPU kernels read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import F32, F64, FloatArray
+from alpasim_plugin.gaussians.camera import Rolling
+from alpasim_plugin.gaussians.constants import TILE
+from alpasim_plugin.gaussians.lens_camera import (
+    LensCamera,
+    LensKey,
+    lens_key,
+    lens_map,
+    lens_rays,
+    spec_of,
+)
+
+# Columns of a camera's numbers, float64.
+LENS_MIDDLE = 0
+LENS_WIDTH, LENS_HEIGHT = 2, 3
+LENS_COS, LENS_SIN = 4, 5  # of the widest angle in the image
+LENS_S_MOST = 6
+LENS_LEAST, LENS_MOST = 7, 8  # pixels per radian
+LENS_MARGIN = 9  # pixels by which every box is grown
+LENS_LINEAR = 10
+LENS_BENDS = 14  # whether there are tangential terms: the six after it
+LENS_ROLLS = 21
+LENS_TIME = 22  # of a pixel: a, b, c of `Rolling.time`
+LENS_TURN = 25  # the camera's own motion in a shutter, in its axes at the middle
+LENS_SHIFT = 28
+LENS_G = 32
+LENS_SLOPE = 48
+LENS_SIZE = 64
+# A block of pixels: their rays' mean, its change to the right and down, and what these two miss.
+BLOCK_ROWS = 10
+STEPS = np.linspace(-1, 1, 4, dtype=np.float32)
+MARGIN_PX = 0.02
+# How a moving node differs from the standing world: rotation vector, velocity and centre, by the
+# shutter, then how much this changes a ray's direction and moment at most.
+MOTION_TURN, MOTION_SPEED, MOTION_CENTRE, MOTION_BOUND_D, MOTION_BOUND_M = 0, 3, 6, 9, 10
+MOTION = 11
+
+
+@dataclass(frozen=True, eq=False)
+class TileRays:
+    """What the pixels of a lens see, in the order of the kernels: by tile, block of 4 x 4 pixels,
+    axis, pixel.
+
+    Attributes:
+        rays: float32, 3 x 16 numbers a block.
+        alive: float32, 16 numbers a block: 1 where the lens sees anything, else -1.
+        blocks: float32, `BLOCK_ROWS` x 16 numbers a tile.
+        lens: float64 ``(LENS_SIZE,)`` of a global shutter.
+    """
+
+    rays: F32
+    alive: F32
+    blocks: F32
+    lens: F64
+
+
+def tile_rays(camera: LensCamera) -> TileRays:
+    """Return the rays of a camera's lens, kept for the next camera with that lens."""
+    return _tile_rays(lens_key(camera.spec))
+
+
+@lru_cache(maxsize=8)
+def _tile_rays(key: LensKey) -> TileRays:
+    spec = spec_of(key)
+    pixel_rays = lens_rays(spec)
+    height = spec.height
+    width = spec.width
+    rows = -(-height // TILE)
+    columns = -(-width // TILE)
+    pad = ((0, rows * TILE - height), (0, columns * TILE - width))
+    alive = np.where(pixel_rays.visible, 1.0, -1.0).astype(np.float32).reshape(height, width)
+    alive = np.pad(alive, pad, constant_values=-1.0)
+    rays = pixel_rays.ray.astype(np.float32).reshape(height, width, 3)
+    rays = np.pad(rays, (*pad, (0, 0)), mode="edge")
+    blocked = rays.reshape(rows, 4, 4, columns, 4, 4, 3).transpose(0, 3, 1, 4, 2, 5, 6)
+    blocked = blocked.reshape(rows * columns, 16, 4, 4, 3)
+    return TileRays(
+        np.ascontiguousarray(blocked.transpose(0, 1, 4, 2, 3)).reshape(-1),
+        np.ascontiguousarray(
+            alive.reshape(rows, 4, 4, columns, 4, 4).transpose(0, 3, 1, 4, 2, 5)
+        ).reshape(-1),
+        _block_table(blocked),
+        _lens_numbers(key),
+    )
+
+
+def _block_table(rays: F32) -> F32:
+    """Return by tile the bilinear part of the rays ``(tiles, 16, 4, 4, 3)`` of each block: mean,
+    change to the right, change down, each x, y, z, and the greatest distance from it.
+    """
+    corners = rays[:, :, ::3, ::3]
+    mean = corners.mean(axis=(2, 3))
+    right = (corners[:, :, :, 1] - corners[:, :, :, 0]).mean(axis=2) / 2
+    down = (corners[:, :, 1] - corners[:, :, 0]).mean(axis=2) / 2
+    flat = (
+        mean[:, :, None, None]
+        + STEPS[None, None, None, :, None] * right[:, :, None, None]
+        + STEPS[None, None, :, None, None] * down[:, :, None, None]
+    )
+    missed = np.sqrt(((rays - flat) ** 2).sum(axis=-1)).max(axis=(2, 3))
+    parts = [*(part.transpose(0, 2, 1) for part in (mean, right, down)), missed[:, None]]
+    return np.ascontiguousarray(np.concatenate(parts, axis=1), dtype=np.float32).reshape(-1)
+
+
+def _lens_numbers(key: LensKey) -> F64:
+    spec = spec_of(key)
+    mapped = lens_map(spec)
+    numbers = np.zeros(LENS_SIZE)
+    numbers[LENS_MIDDLE : LENS_MIDDLE + 2] = mapped.middle
+    numbers[LENS_WIDTH], numbers[LENS_HEIGHT] = spec.width, spec.height
+    numbers[LENS_COS], numbers[LENS_SIN] = np.cos(mapped.widest_rad), np.sin(mapped.widest_rad)
+    numbers[LENS_S_MOST] = mapped.s_most
+    numbers[LENS_LEAST], numbers[LENS_MOST] = mapped.px_per_rad
+    numbers[LENS_MARGIN] = MARGIN_PX + mapped.error_px
+    numbers[LENS_LINEAR : LENS_LINEAR + 4] = mapped.linear.ravel()
+    numbers[LENS_BENDS] = any(mapped.bent)
+    numbers[LENS_BENDS + 1 : LENS_BENDS + 7] = mapped.bent
+    polynomial = mapped.polynomial
+    slope = np.polynomial.polynomial.polyder(polynomial) * (2 / mapped.s_most)
+    numbers[LENS_G : LENS_G + len(polynomial)] = polynomial
+    numbers[LENS_SLOPE : LENS_SLOPE + len(slope)] = slope
+    return numbers
+
+
+def camera_lens(camera: LensCamera) -> F64:
+    """Return a camera's numbers ``(LENS_SIZE,)`` with its shutter."""
+    numbers = tile_rays(camera).lens.copy()
+    if camera.rolling is not None:
+        T_middle_start = camera.T_camera_world @ inverse(camera.rolling.T_camera_world_start)
+        numbers[LENS_ROLLS] = 1.0
+        numbers[LENS_TIME : LENS_TIME + 3] = camera.rolling.time
+        numbers[LENS_TURN : LENS_TURN + 3] = -2 * cv2.Rodrigues(T_middle_start[:3, :3])[0].ravel()
+        numbers[LENS_SHIFT : LENS_SHIFT + 3] = -2 * T_middle_start[:3, 3]
+    return numbers
+
+
+def node_motion(
+    camera: LensCamera, rolling: Rolling, T_world_node: FloatArray, T_world_start: F64
+) -> F32:
+    """Return how a node moves in the world while a shutter is open, in the camera's axes at its
+    middle ``(MOTION,)``: its centre evenly along a line, itself about its centre.
+    """
+    T = camera.T_camera_world
+    middle = T @ T_world_node
+    before = T @ T_world_start
+    turn = -2 * cv2.Rodrigues(before[:3, :3] @ middle[:3, :3].T)[0].ravel()
+    centre = middle[:3, 3]
+    speed = 2 * (centre - before[:3, 3])
+    camera_half = float(np.linalg.norm((T @ inverse(rolling.T_camera_world_start))[:3, 3]))
+    bound = 0.51 * float(np.linalg.norm(turn))
+    moved = 0.51 * float(np.linalg.norm(speed)) + bound * (
+        float(np.linalg.norm(centre)) + camera_half + 1.0
+    )
+    return np.array([*turn, *speed, *centre, bound, moved + bound * camera_half], dtype=np.float32)

@@ -1,0 +1,231 @@
+import numpy as np
+import pytest
+
+from alpasim_plugin.cameras.shutter import rolling as shares
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import CameraSpec, LensModel
+from alpasim_plugin.gaussians import (
+    GaussianCloud,
+    PinholeCamera,
+    prepare,
+    rasterize,
+    rasterize_prepared,
+)
+from alpasim_plugin.gaussians.camera import Rolling
+from alpasim_plugin.gaussians.lens_camera import LensCamera
+from tests.gaussians.lens_reference import LensReference, Motion, least_distance_along
+
+WIDTH = 80
+HEIGHT = 60
+LENSES = {
+    "pinhole": (45.0, None),
+    "opencv": (
+        50.0,
+        LensModel(
+            "opencv",
+            (-0.28, 0.08, 1e-3, -7e-4, -0.01, 0.0, 0.0, 0.0, 1e-3, -5e-4, 8e-4, 3e-4),
+        ),
+    ),
+    "fisheye": (22.0, LensModel("fisheye", (0.02, -0.004, 0.001), max_angle_rad=np.deg2rad(100))),
+    "ftheta": (1.0, LensModel("ftheta", (0.0, 40.0, 0.0, -0.6), (), (1.01, 0.01, -0.02))),
+    "ftheta-backward": (1.0, LensModel("ftheta", (), (0.0, 1 / 40, 0.0, 1e-7))),
+    # beyond 95 degrees its radius falls
+    "turning": (1.0, LensModel("ftheta", (0.0, 40.0, 0.0, -4.85), max_angle_rad=np.deg2rad(80))),
+}
+
+
+def spec(name):
+    focal, lens = LENSES[name]
+    K = np.array([[focal, 0, WIDTH / 2 + 1], [0, 1.02 * focal, HEIGHT / 2 - 1], [0, 0, 1]])
+    return CameraSpec(name, WIDTH, HEIGHT, K, np.eye(4), 0, lens)
+
+
+def pose(turn, place):
+    start = Motion(np.eye(4), np.eye(4))
+    start.turn = np.asarray(turn, dtype=np.float64)
+    T = start.at(1.0)
+    T[:3, 3] = place
+    return T
+
+
+WORLD = pose([0.1, 0.2, -0.1], [0.1, 0.2, 0.3])
+# Half of 30 ms at 15 m/s and 30 degrees a second.
+BACK = pose([0.0, -0.00785, 0.0], [0.02, 0.01, -0.225])
+
+
+def camera(name, rolls=False, T_world_camera=WORLD):
+    T = inverse(T_world_camera)
+    if not rolls:
+        return LensCamera(spec(name), T)
+    step = 1 / (HEIGHT - 1)
+    start = inverse(T_world_camera @ BACK)
+    return LensCamera(spec(name), T, Rolling(start, {}, (0.0, step, -0.5 - 0.5 * step), 10.0))
+
+
+def cloud_of(p, scales, opacity=0.8, seed=0, antialias_px2=0.0, T_world_camera=WORLD):
+    """Return Gaussians at places of the camera's axes, turned at random."""
+    rng = np.random.default_rng(seed)
+    p = np.atleast_2d(np.asarray(p, dtype=np.float64))
+    means = p @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    quats = rng.normal(size=(len(p), 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    sizes = np.broadcast_to(np.asarray(scales, dtype=np.float64), (len(p), 3))
+    opacities = np.broadcast_to(opacity, len(p)).copy()
+    sh = 0.3 * rng.normal(size=(len(p), 4, 3))
+    return GaussianCloud(means, quats, sizes.copy(), opacities, sh, antialias_px2=antialias_px2)
+
+
+def around(count, seed, least_m=1.0, most_m=20.0):
+    """Return directions and distances all about the camera."""
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return d * rng.uniform(least_m, most_m, (count, 1))
+
+
+def check(nodes, seen, starts=(), count=150, seed=0):
+    """Compare pixels with the reference: at most 3/255 apart, nearly all within 1/255."""
+    out = rasterize_prepared(
+        [(prepare(cloud), T) for cloud, T in nodes], seen, threads=1, starts=starts
+    )
+    reference = LensReference(nodes, seen, starts)
+    rng = np.random.default_rng(seed)
+    places = np.argwhere(seen.visible)
+    apart = []
+    for row, column in rng.choice(places, min(count, len(places)), replace=False):
+        colour, alpha, depth = reference.pixel(row, column)
+        apart.append(np.abs(np.clip(colour, 0, 1) - out.rgb[row, column]).max())
+        apart.append(abs(alpha - out.alpha[row, column]))
+        assert out.depth[row, column] == pytest.approx(depth, rel=0.02, abs=0.01)
+    apart = 255 * np.array(apart)
+    assert apart.max() <= 3.0
+    assert np.mean(apart <= 1.0) >= 0.999
+    return out
+
+
+@pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])
+@pytest.mark.parametrize("name", LENSES)
+def test_pixels_are_those_of_the_definition(name, rolls):
+    rng = np.random.default_rng(1)
+    scales = np.exp(rng.uniform(-4, 0, (150, 3)))
+    world = cloud_of(around(150, 2), scales, rng.uniform(0.05, 1, 150))
+    scales = np.exp(rng.uniform(-4, 0, (60, 3)))
+    user = cloud_of(around(60, 3, 0.2, 2), scales, 0.7, 4, 0.1, np.eye(4))
+    T = WORLD @ pose([0, 0.3, 0], [0.5, 0.2, 5])
+    starts = [None, WORLD @ pose([0.004, 0.31, 0], [0.3, 0.2, 5.2])] if rolls else ()
+    out = check([(world, None), (user, T)], camera(name, rolls), starts)
+    assert out.alpha[camera(name).visible].mean() > 0.1
+
+
+HARD = {
+    "behind": (around(80, 5) - [0, 0, 12.0], (0.3, 0.2, 0.1)),
+    "at 90 degrees and beyond": (
+        [
+            [3 * np.sin(a), 0.2 * k, 3 * np.cos(a)]
+            for k, a in enumerate(np.deg2rad([85, 90, 95, 105]))
+        ],
+        (0.4, 0.1, 0.3),
+    ),
+    "needles": (around(60, 6), (10.0, 1e-3, 1e-3)),
+    "discs": (around(60, 7, 0.5), (1.0, 1.0, 1e-4)),
+    "flat ones in the plane of a ray": (
+        [[0, 0.0, 4], [0, 0.001, 6], [0.3, 0, 5]],
+        (1.0, 1.0, 1e-6),
+    ),
+    "enclosing": (around(12, 8, 0.2, 1.5), (1.5, 1.0, 0.8)),
+    "large beside the camera": (
+        [[2.0, 0, 0.1], [-1.5, 0.5, -0.5], [0, 1.5, 0.5]],
+        (3.0, 1.0, 0.05),
+    ),
+    "near": (around(60, 9, 0.3, 1.0), (0.05, 0.02, 0.01)),
+}
+
+
+@pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])
+@pytest.mark.parametrize("name", ["opencv", "fisheye", "turning"])
+@pytest.mark.parametrize("case", HARD)
+def test_hard_cases_are_those_of_the_definition(case, name, rolls):
+    places, scales = HARD[case]
+    check([(cloud_of(places, scales, 0.6, 10), None)], camera(name, rolls), count=80)
+
+
+def test_thin_poles_at_speed_stand_where_the_definition_puts_them():
+    poles = GaussianCloud(
+        [[x, 0.0, 4.0 + k] for k, x in enumerate((-3, -1.5, 0, 1.5, 3))],
+        [[1.0, 0, 0, 0]] * 5,
+        [[0.03, 2.0, 0.03]] * 5,
+        [0.95] * 5,
+        np.ones((5, 1, 3)),
+    )
+    nodes = [(poles, None)]
+    rolled = check(nodes, camera("fisheye", True, np.eye(4)))
+    still = check(nodes, camera("fisheye", False, np.eye(4)))
+    assert np.abs(rolled.rgb - still.rgb).max() > 0.1
+
+
+def test_the_response_is_the_greatest_along_a_ray():
+    seen = camera("fisheye", True)
+    world = cloud_of(around(20, 11, 0.3, 4), (0.8, 0.3, 0.1), 0.9, 12)
+    reference = LensReference([(world, None)], seen)
+    for row, column in ((10, 20), (30, 40), (50, 70)):
+        o, d = reference.ray(row, column, 0)
+        q2 = [
+            least_distance_along(S, p, o, d, 30.0)
+            for S, p in zip(reference.splats.S, reference.splats.p, strict=True)
+        ]
+        expected = np.minimum(0.99, reference.splats.opacity * np.exp(-0.5 * np.array(q2)))
+        np.testing.assert_allclose(reference.alphas(row, column), expected, atol=1e-6)
+
+
+def test_small_gaussians_in_a_pinhole_are_those_of_the_affine_map():
+    rng = np.random.default_rng(13)
+    places = np.column_stack([rng.uniform(-2, 2, (200, 2)), rng.uniform(8, 12, 200)])
+    world = cloud_of(places, (0.02, 0.01, 0.015), 0.5)
+    plain = spec("pinhole")
+    flat = rasterize(world, PinholeCamera(WIDTH, HEIGHT, plain.K, inverse(WORLD)))
+    along_rays = rasterize(world, LensCamera(plain, inverse(WORLD)))
+    assert np.abs(flat.rgb - along_rays.rgb).max() < 3 / 255
+    assert flat.alpha.max() > 0.2
+
+
+def test_the_image_does_not_depend_on_the_threads():
+    rng = np.random.default_rng(14)
+    world = cloud_of(around(9000, 15), np.exp(rng.uniform(-4, -2, (9000, 3))))
+    nodes = [(prepare(world), None)]
+    first, second = (
+        rasterize_prepared(nodes, camera("fisheye", True), threads=threads) for threads in (1, 2)
+    )
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+    np.testing.assert_array_equal(first.depth, second.depth)
+
+
+def test_where_a_lens_sees_nothing_it_is_black_and_opaque():
+    world = cloud_of(around(50, 16), (0.5, 0.5, 0.5))
+    seen = camera("turning")
+    out = rasterize(world, seen, (1.0, 1.0, 1.0))
+    assert not seen.visible.all()
+    assert not out.rgb[~seen.visible].any()
+    assert (out.alpha[~seen.visible] == 1).all()
+    assert not out.depth[~seen.visible].any()
+    assert (out.rgb[seen.visible] > 0).any()
+
+
+def test_columns_exposed_backwards_are_those_of_the_definition():
+    share = shares(WIDTH, HEIGHT, "columns", backwards=True)
+    step = float(share[0, 1] - share[0, 0])
+    plain = camera("ftheta", True)
+    rolling = Rolling(
+        plain.rolling.T_camera_world_start,
+        {},
+        (step, 0.0, float(share[0, 0]) - 0.5 - 0.5 * step),
+        10.0,
+    )
+    seen = LensCamera(plain.spec, plain.T_camera_world, rolling)
+    check([(cloud_of(around(100, 17), (0.3, 0.1, 0.2)), None)], seen)
+
+
+def test_other_backends_refuse_a_lens():
+    world = cloud_of([[0, 0, 5]], (0.1, 0.1, 0.1))
+    with pytest.raises(InputError, match="use the backend cpu"):
+        rasterize(world, camera("fisheye"), backend="reference")
