@@ -301,7 +301,7 @@ def cell_data(run: Run, cell: WatchedCell, logs: Logs) -> JsonObject:
     firsts_us = [int(log.ego.t_us[0]) for log in logs.values() if isinstance(log, RolloutLog)]
     place = Place(recorded[0], clock_zero_us(content, min(firsts_us, default=0)))
     tracks = Tracks()
-    drives = [
+    drives: list[JsonObject] = [
         {"renderer": cell.side(rollout)} | _drive(run, rollout, logs, place, tracks)
         for rollout in cell.rollouts
     ]
