@@ -259,6 +259,7 @@ def _between(ego: Footprints, actors: ActorTable, t_us: I64, touch: Bool) -> _Fo
     actor, t0, t1 = np.concatenate(pieces, axis=1)
     interval = np.searchsorted(t_us, t0, side="right") - 1
     is_open = ~touch[actor, interval]
+    is_open &= actors.on_level(actor, t0) | actors.on_level(actor, t1)
     actor, interval, t0, t1 = actor[is_open], interval[is_open], t0[is_open], t1[is_open]
     pairs = _motions(ego, actors, t_us, actor, interval, t0, t1)
     near = np.flatnonzero(pairs.distance_m() <= pairs.radius_m().sum(axis=1) + _SLACK_M)

@@ -19,6 +19,7 @@ from alpasim_plugin.core.types import F64, I64, Bool, RolloutLog, Trajectory
 from evaluators.metrics.presets import Preset
 
 Geometries = npt.NDArray[Any]  # of shapely geometries
+LEVEL_SLOPE = 0.05  # a hill may lift somebody on the ego's road by so much a metre of distance
 
 
 def origin_of(track: Trajectory, preset: Preset) -> F64:
@@ -129,11 +130,31 @@ class ActorTable:
     """Tracks of all actors of a rollout, laid end to end, so that many times are looked up at once.
 
     An actor exists from its first to its last logged time, both included; between logged times its
-    pose is interpolated (position linearly, rotation by slerp).
+    pose is interpolated (position linearly, rotation by slerp). Who is on another level than the ego,
+    on a bridge above it or on a road below, is not there for it: their heights do not overlap, not
+    even with `LEVEL_SLOPE` per metre between them. Presets without ``levels`` know no heights.
     """
 
-    def __init__(self, rollout: RolloutLog, preset: Preset, origin: F64) -> None:
+    def __init__(
+        self, rollout: RolloutLog, preset: Preset, origin: F64, centre: Trajectory | None = None
+    ) -> None:
+        """Lay out the tracks.
+
+        Args:
+            rollout: The log.
+            preset: Sizes, rounding and levels.
+            origin: ``(3,)`` world point that positions are relative to.
+            centre: Of the ego's box, whose level counts; None: as it drove.
+        """
         actors = list(rollout.actors.values())
+        ego = rollout.ego if centre is None else centre
+        self._ego_t_us = ego.t_us
+        self._ego_xyz = ego.xyz - origin
+        self._ego_height_m = rollout.ego_box.height_m
+        self._z = np.concatenate(
+            [np.zeros(0), *(actor.track.xyz[:, 2] - origin[2] for actor in actors)]
+        )
+        self._height_m = np.array([actor.box.height_m for actor in actors])
         self.ids = tuple(actor.actor_id for actor in actors)
         self._t = [actor.track.t_us for actor in actors]
         self._start = np.concatenate([[0], np.cumsum([len(t) for t in self._t])]).astype(np.int64)
@@ -160,16 +181,44 @@ class ActorTable:
         present = np.zeros(shape, dtype=np.bool_)
         for a in range(len(self)):
             row[a], fraction[a], present[a] = self._locate(a, t_us)
+        if self.preset.levels:
+            actor, query = np.nonzero(present)
+            pairs = row[actor, query], fraction[actor, query]
+            present[actor, query] = self._on_level(actor, t_us[query], *pairs)
         return ActorsAt(self, row, fraction, present)
+
+    def on_level(self, actor: I64, t_us: I64) -> Bool:
+        """Return which actors ``(M,)`` are on the ego's level at times ``(M,)`` at which they are
+        present.
+        """
+        if not self.preset.levels:
+            return np.ones(len(actor), dtype=np.bool_)
+        row, fraction = self._located(actor, t_us)
+        return self._on_level(actor, t_us, row, fraction)
+
+    def _on_level(self, actor: I64, t_us: I64, row: I64, fraction: F64) -> Bool:
+        follows = np.where(fraction > 0, row + 1, row)
+        xy = self._xy[row] * (1 - fraction)[:, None] + self._xy[follows] * fraction[:, None]
+        z = self._z[row] * (1 - fraction) + self._z[follows] * fraction
+        x_m, y_m, z_m = (np.interp(t_us, self._ego_t_us, column) for column in self._ego_xyz.T)
+        apart_m = np.hypot(xy[:, 0] - x_m, xy[:, 1] - y_m)
+        reach_m = (self._height_m[actor] + self._ego_height_m) / 2
+        return np.abs(z - z_m) <= reach_m + LEVEL_SLOPE * apart_m
 
     def boxes(self, actor: I64, t_us: I64) -> Footprints:
         """Return the boxes ``(M,)`` of actors at times ``(M,)`` at which they are present."""
+        return self.boxes_at(actor, *self._located(actor, t_us))
+
+    def _located(self, actor: I64, t_us: I64) -> tuple[I64, F64]:
+        """Return the logged rows ``(M,)`` of actors before or at times ``(M,)``, and the shares of
+        the way to the next ones.
+        """
         row = np.zeros(len(actor), dtype=np.int64)
         fraction = np.zeros(len(actor))
         for a in np.unique(actor):
             rows = np.flatnonzero(actor == a)
             row[rows], fraction[rows], _ = self._locate(int(a), t_us[rows])
-        return self.boxes_at(actor, row, fraction)
+        return row, fraction
 
     def boxes_at(self, actor: I64, row: I64, fraction: F64) -> Footprints:
         """Return the boxes ``(M,)`` of actors at a share ``(M,)`` of the way from logged rows

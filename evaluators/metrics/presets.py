@@ -30,6 +30,8 @@ class Preset:
     ego_size_m: tuple[float, float] | None = None  # length, width; None: as logged
     shrink: float = 0.0
     roundness: float = 0.0
+    # Whether boxes have heights: who is on a bridge above the ego or on a road below is not near it.
+    levels: bool = True
     # Collision. "every": each touching actor is classified. "last": only the last one that the
     # spatial index returns is.
     hits: Literal["every", "last"] = "every"
@@ -130,6 +132,7 @@ ALPASIM = Preset(
     reproduces="AlpaSim, alpasim_eval 1.36.0 (main, commit 3032e0c, July 2026, wire API 0.54.0)",
     shrink=0.02,
     roundness=0.5,
+    levels=False,
     hits="last",
     lane_query="vertices",
     seam_m=0.0,

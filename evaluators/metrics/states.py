@@ -141,7 +141,7 @@ def states_of(
     """
     t_us = centre.t_us
     ego = ego_states(rollout, preset, offset_trajectory(centre, inverse(rollout.T_rig_box)), origin)
-    table = ActorTable(rollout, preset, origin)
+    table = ActorTable(rollout, preset, origin, centre)
     actors_at = table.at(t_us)
     actor, step = np.nonzero(actors_at.present)
     xy = np.zeros((len(table), len(t_us), 2))
