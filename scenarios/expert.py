@@ -79,10 +79,12 @@ class ScriptedTracks:
         xy = np.array([script.track.xyz[0, :2] for script in still])
         yaw = np.array([float(yaw_from_quat(script.track.quat[0])) for script in still])
         boxes = [script.box for script in still]
-        self.standing = bodies_from(xy, yaw, boxes, np.zeros((len(still), 2)))
+        z = np.array([script.track.xyz[0, 2] for script in still])
+        self.standing = bodies_from(xy, yaw, boxes, np.zeros((len(still), 2)), z)
         n = len(self.times)
         self.boxes = [script.box for script in going]
         self.xy = np.zeros((n, len(going), 2))
+        self.z = np.zeros((n, len(going)))
         self.yaw = np.zeros((n, len(going)))
         self.velocity = np.zeros((n, len(going), 2))
         self.present = np.zeros((n, len(going)), dtype=np.bool_)
@@ -93,6 +95,7 @@ class ScriptedTracks:
             t = np.clip(self.times, first_us, last_us)
             for d in range(2):
                 self.xy[:, j, d] = np.interp(t, track.t_us, track.xyz[:, d])
+            self.z[:, j] = np.interp(t, track.t_us, track.xyz[:, 2])
             self.yaw[:, j] = np.interp(t, track.t_us, np.unwrap(yaw_from_quat(track.quat)))
             self.velocity[:, j] = np.gradient(self.xy[:, j], DECISION_US * 1e-6, axis=0)
             # A track that ends with the scene (and not by leaving the road) goes on standing in the
@@ -115,6 +118,7 @@ class PredictedBodies:
     velocity: F64  # (1 + n, K, 2)
     present: Bool  # (1 + n, K)
     boxes: tuple[Box, ...]
+    z: F64  # (1 + n, K) of the centre
     yields: Bool  # (K,) reactive: it lets the ego go first when it is behind
 
     def now(self) -> Bodies:
@@ -122,7 +126,11 @@ class PredictedBodies:
         columns = np.flatnonzero(self.present[0])
         boxes = [self.boxes[k] for k in columns]
         return bodies_from(
-            self.xy[0, columns], self.yaw[0, columns], boxes, self.velocity[0, columns]
+            self.xy[0, columns],
+            self.yaw[0, columns],
+            boxes,
+            self.velocity[0, columns],
+            self.z[0, columns],
         )
 
 
@@ -156,6 +164,7 @@ def yielding_acceleration(
         ahead.yaw.reshape(-1),
         ahead.boxes * n,
         ahead.velocity.reshape(-1, 2),
+        ahead.z,
     )
     window = np.array([front_s - BEHIND_M, front_s + HORIZON_M])
     row = np.arange(n * k)
@@ -164,6 +173,7 @@ def yielding_acceleration(
     half = box.width_m / 2 + SIDE_M
     rear, front, speed = (array.reshape(n, k) for array in (span.rear, span.front, span.speed))
     inside = ((span.low < half) & (span.high > -half)).reshape(n, k) & ahead.present
+    inside &= span.on_level.reshape(n, k)
     inside &= (rear > window[0]) & (rear < window[1])
     tau = TIMES_S[:, None]
     passed = front < front_s + speed_mps * tau - box.length_m - 1.0
@@ -292,6 +302,7 @@ class _Expert:
             yaw,
             [self.vehicle.box],
             self.v * direction,
+            xyz[2:] + self.vehicle.box.height_m / 2,
         )
 
     def decide(self, others: Bodies, ahead: PredictedBodies, t_us: int) -> float:
@@ -406,6 +417,7 @@ def _predicted(
     yaw = [table.yaw[rows]]
     velocity = [table.velocity[rows]]
     present = [table.present[rows]]
+    z = [table.z[rows]]
     if lines is not None:
         s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
         stations = s + v * TIMES_S[:, None]  # (1 + n, K)
@@ -418,11 +430,14 @@ def _predicted(
         yaw.append(heading)
         velocity.append(v[:, None] * direction_of(heading))
         present.append(stations <= lines.length_m)
+        half_m = np.array([car.f.box.height_m / 2 for car in cars])
+        z.append(points[:, 2].reshape(stations.shape) + half_m)
     return PredictedBodies(
         np.concatenate(xy, axis=1),
         np.concatenate(yaw, axis=1),
         np.concatenate(velocity, axis=1),
         np.concatenate(present, axis=1),
         (*table.boxes, *(car.f.box for car in cars)),
+        np.concatenate(z, axis=1),
         np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
     )

@@ -26,7 +26,7 @@ from scenarios.expert import Follower, drive
 from scenarios.junction_rules import turning_lines
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
 from scenarios.map_route import NARROWEST_M, STATION_M, WIDEST_M, LaneGraph, Spot, Way
-from scenarios.map_traffic import place_followers
+from scenarios.map_traffic import place_followers, stopping_m
 from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
@@ -353,18 +353,22 @@ def _timed(
     heads: Sequence[Head], line: Path, lane_map: LaneMap, front_m: float, cruise_mps: float
 ) -> tuple[Signal, ...]:
     """Return the lights with their cycles: the first one on the route turns yellow shortly before
-    the ego, on a free road, would pass it.
+    the ego, on a free road, would pass it; one that is too near to stop at is green then.
     """
     signals = [head.signal for head in heads]
-    first = next(iter(lights_on(line, signals, lane_map.lanes)), None)
+    lights = lights_on(line, signals, lane_map.lanes)
+    first = next((light for light in lights if light.s_m >= front_m), None)
     begins_us: dict[str, int] = {}
     if first is not None:
         number = next(n for n, signal in enumerate(signals) if signal is first.signal)
         head = heads[number]
         timed_signal = with_cycles(heads, {})[number]
-        arrival_us = round((first.s_m - front_m) / cruise_mps * 1e6)
+        gap_m = first.s_m - front_m
         green_us = timed_signal.phases[0][1]
-        turns_green_us = arrival_us - round(YELLOW_AHEAD_S * 1e6) - green_us
+        passed_us = round(YELLOW_AHEAD_S * 1e6) + green_us  # since it has turned green
+        if gap_m < stopping_m(cruise_mps):
+            passed_us = green_us // 2
+        turns_green_us = round(gap_m / cruise_mps * 1e6) - passed_us
         begins_us[head.junction] = turns_green_us - timed_signal.offset_us
     return with_cycles(heads, begins_us)
 

@@ -14,7 +14,7 @@ import scipy
 from alpasim_plugin.core.types import LaneMap
 from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
-from alpasim_plugin.world.signals import LightAhead, lights_on
+from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
 from scenarios.expert import Follower
 from scenarios.junction_rules import green_together
 from scenarios.map_route import LaneGraph, Way
@@ -30,6 +30,8 @@ RULED_M = 60.0  # a rule is looked for so far before the place where they do
 SPEED_MPS = (7.0, 11.0)
 SLOWEST_MPS = 3.0  # whatever limits say
 BEND_MPS2 = 3.0  # lateral acceleration in bends
+STOP_MPS2 = 2.0  # before a stop line
+STOP_ROOM_M = 3.0  # that is kept before it, and what the brake takes to act
 TRIES = 8  # for each vehicle
 
 
@@ -76,16 +78,24 @@ def place_followers(
         candidate = ride_on(own_way, graph.line(own_way))
         if any(_too_close(candidate, other) or not _is_ruled(candidate, other) for other in rides):
             continue
-        rides.append(candidate)
         posted_mps = max(float(graph.limits_mps(own_way, candidate.path).min()), SLOWEST_MPS)
         wanted_mps = min(wanted_mps, posted_mps)
         params = {"desired_speed_mps": wanted_mps, "lateral_accel_mps2": BEND_MPS2}
         begin_mps = float(allowed_speeds(candidate.path, wanted_mps, BEND_MPS2)[0])
+        front_m = SIZES["car"].length_m / 2
+        if red_gap_m(candidate.lights, front_m, begin_mps, 0) < stopping_m(begin_mps):
+            continue
+        rides.append(candidate)
         name = f"car-{len(followers)}"
         followers.append(
             Follower(name, "car", candidate.path, 0.0, begin_mps, SIZES["car"], params)
         )
     return followers
+
+
+def stopping_m(speed_mps: float) -> float:
+    """Return the distance to a stop line from which a driver still stops at it without haste."""
+    return speed_mps**2 / (2.0 * STOP_MPS2) + STOP_ROOM_M
 
 
 def _too_close(ride: _Ride, other: _Ride) -> bool:

@@ -32,7 +32,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     Vehicle,
 )
-from alpasim_plugin.world.ground import ground_pose
+from alpasim_plugin.world.ground import STACKED_M, ground_pose
 from alpasim_plugin.world.idm import (
     Bodies,
     IdmParams,
@@ -129,12 +129,14 @@ class Actors:
                 heading_of(poses[:, :2, 0]),
                 [actor.box for actor in replayed],
                 velocity,
+                poses[:, 2, 3],
             )
             yaw = yaw_of(ego.T_world_rig)
             direction = direction_of(yaw)
             centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
+            height_m = ego.T_world_rig[2:3, 3] + self.vehicle.box.height_m / 2
             reactive = bodies_from(
-                centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction
+                centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction, height_m
             )
             others = concatenate([reactive, bodies])
             self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
@@ -172,7 +174,9 @@ class Actors:
             boxes = [driver.actor.box for driver, _ in driving]
             xyz, yaws = lines.at(line, s_m, offset_m)
             directions = direction_of(yaws)
-            moving = bodies_from(xyz[:, :2], yaws, boxes, speed_mps[:, None] * directions)
+            moving = bodies_from(
+                xyz[:, :2], yaws, boxes, speed_mps[:, None] * directions, xyz[:, 2]
+            )
             everybody = concatenate([others, moving])
             leaders = find_leaders(
                 lines,
@@ -439,6 +443,10 @@ class _Driver:
             return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))
         T[:3, 3] += self.actor.box.height_m / 2 * T[:3, 2]
+        if (
+            abs(T[2, 3] - xyz[2]) > STACKED_M
+        ):  # the line runs on a bridge above that ground, or below
+            return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         return T
 
 
@@ -461,5 +469,5 @@ def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
     # The track need not run in the lane's middle: keep its offset and fade it out.
     s = np.arange(FADE_STEP_M, way.length_m, FADE_STEP_M)
     points, _ = way.at(s, float(offset[0]) * (1.0 - smoothstep(s / FADE_M)))
-    points[:, 2] = end[2]
+    points[:, 2] += end[2] - xyz[0, 2]
     return points

@@ -11,6 +11,9 @@ from alpasim_plugin.core.types import F64, HeightField
 
 MAX_NODES = 30_000_000  # 240 MB of heights
 SIGHT_M = 400.0  # nothing farther from a drive is built or seen, so no ground is fitted there
+STACKED_M = 2.5  # points of one place that lie farther apart in height are of several roads ...
+PLACE_M = 4.0  # ... where a place is a square of this side
+SLOPE = 0.1  # beside a drive the ground may lie so much higher or lower per metre of distance
 BUILT_WHOLE_M = 1500.0  # a longer drive is built in sections, those within `SIGHT_M` of a camera
 SLOPE_SPAN_M = 1.5  # half the length over which a pose's slope is taken: about half a wheelbase
 
@@ -30,8 +33,10 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     Args:
         points: ``(N, 3)`` metres, world; order does not matter.
         cell_m: Grid step in metres.
-        drive: ``(T, 3)`` positions of the ego; points more than `SIGHT_M` outside the rectangle
-            around them are left out, so that a large map costs no more than what is seen of it.
+        drive: ``(T, 3)`` positions of the ego on the ground; points more than `SIGHT_M` outside the
+            rectangle around them are left out, so that a large map costs no more than what is seen
+            of it. Where roads lie above one another, the one at the height of the nearest position
+            counts.
 
     Raises:
         InputError: The grid would have more than `MAX_NODES` nodes.
@@ -43,7 +48,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
             & (xyz[:, :2] <= drive[:, :2].max(axis=0) + SIGHT_M),
             axis=1,
         )
-        xyz = xyz[near] if near.any() else drive
+        xyz = _on_level_of(drive, xyz[near]) if near.any() else drive
     low = np.floor(xyz[:, :2].min(axis=0) / cell_m) * cell_m
     nx, ny = (int(n) + 2 for n in np.floor((xyz[:, :2].max(axis=0) - low) / cell_m))
     if nx * ny > MAX_NODES:
@@ -66,6 +71,29 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
         inside = scipy.interpolate.LinearNDInterpolator(local, means[:, 2])(nodes - means[0, :2])
         z = np.where(np.isnan(inside), z, inside)
     return HeightField(float(low[0]), float(low[1]), float(cell_m), z.reshape(ny, nx))
+
+
+def _on_level_of(drive: F64, xyz: F64) -> F64:
+    """Return points ``(N, 3)`` without those of bridges above a drive and of roads below it; all of
+    them where no place has two heights.
+    """
+    place = np.floor(xyz[:, :2] / PLACE_M).astype(np.int64)
+    _, number = np.unique(place, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    lowest_m = np.full(number.max() + 1, np.inf)
+    highest_m = np.full(number.max() + 1, -np.inf)
+    np.minimum.at(lowest_m, number, xyz[:, 2])
+    np.maximum.at(highest_m, number, xyz[:, 2])
+    is_stacked = (highest_m - lowest_m > STACKED_M)[number]
+    if not is_stacked.any():
+        return xyz
+    away_m, nearest = scipy.spatial.KDTree(drive[:, :2]).query(xyz[:, :2])
+    apart_m = np.abs(xyz[:, 2] - drive[nearest, 2])
+    least_m = np.full(number.max() + 1, np.inf)
+    np.minimum.at(least_m, number, apart_m)
+    most_m = np.where(is_stacked, least_m[number] + STACKED_M / 2, STACKED_M + SLOPE * away_m)
+    on_level = apart_m <= most_m
+    return xyz[on_level] if on_level.any() else xyz
 
 
 def height_at(field: HeightField, xy: F64) -> F64:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, I64, Box
+from alpasim_plugin.core.types import F64, I64, Bool, Box
 from alpasim_plugin.world.path import Lines, Path
 
 COMFORT_BRAKE_MPS2 = 1.5  # before bends
@@ -107,6 +107,8 @@ class Bodies:
     half_length_m: F64  # (M,)
     half_width_m: F64  # (M,)
     velocity: F64  # (M, 2) metres per second, world
+    z: F64  # (M,) height of the centre, metres, world; NaN: not known, on every level
+    half_height_m: F64  # (M,)
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,7 @@ class Leader:
 
 NO_LEADER = Leader(float("inf"), 0.0, -1)
 
+LEVEL_M = 1.25  # a line and the nearest face of a body on its level are no farther apart in height
 BEHIND_M = 15.0  # a body is looked for so far behind the own front bumper
 _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -133,6 +136,7 @@ class Spans:
     low: F64  # (P,) rightmost distance from the line
     high: F64  # (P,) leftmost
     speed: F64  # (P,) along the line, >= 0
+    on_level: Bool  # (P,) whether the body is at the height of the line, not on a bridge or below
 
 
 def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64) -> Spans:
@@ -151,10 +155,16 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
     along = along.reshape(-1, len(_OUTLINE))
     across = across.reshape(-1, len(_OUTLINE))
     rear = along.min(axis=1)
-    _, yaw = lines.at(line, rear)
+    xyz, yaw = lines.at(line, rear)
+    is_apart = np.abs(bodies.z[row] - xyz[:, 2]) > bodies.half_height_m[row] + LEVEL_M
     speed = bodies.velocity[row, 0] * np.cos(yaw) + bodies.velocity[row, 1] * np.sin(yaw)
     return Spans(
-        rear, along.max(axis=1), across.min(axis=1), across.max(axis=1), np.maximum(speed, 0.0)
+        rear,
+        along.max(axis=1),
+        across.min(axis=1),
+        across.max(axis=1),
+        np.maximum(speed, 0.0),
+        ~is_apart,
     )
 
 
@@ -186,7 +196,7 @@ def find_leaders(
     """Return the leader of each of many drivers: the nearest body that reaches into the corridor of
     its line ahead of its front bumper.
 
-    A body counts when its outline overlaps ``+-(half_width_m + margin_m)`` across the line and its
+    A body counts when it is on the line's level, its outline overlaps ``+-(half_width_m + margin_m)`` across the line and its
     rear end is not more than 2 m behind the own front bumper, so that touching bodies still count.
 
     Args:
@@ -210,7 +220,7 @@ def find_leaders(
     span = spans(lines, line[driver], bodies, body, low[driver], high[driver])
     gap_m = span.rear - front_s_m[driver]
     ahead = (span.low < reach[driver]) & (span.high > -reach[driver])
-    ahead &= (gap_m > -2.0) & (gap_m < horizon_m[driver])
+    ahead &= span.on_level & (gap_m > -2.0) & (gap_m < horizon_m[driver])
     out = [NO_LEADER] * len(line)
     for k in np.lexsort((body, gap_m))[::-1]:  # the nearest last
         if ahead[k]:
@@ -218,17 +228,21 @@ def find_leaders(
     return out
 
 
-def bodies_from(xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64) -> Bodies:
-    """Build `Bodies` from centres ``(M, 2)``, headings ``(M,)``, boxes and velocities ``(M,
-    2)``.
+def bodies_from(
+    xy: F64, yaw: F64, boxes: Sequence[Box], velocity: F64, z: F64 | None = None
+) -> Bodies:
+    """Build `Bodies` from centres ``(M, 2)``, headings ``(M,)``, boxes, velocities ``(M, 2)`` and
+    heights ``(M,)`` of the centres; without heights they are on every level.
     """
-    half = np.array([[b.length_m / 2, b.width_m / 2] for b in boxes]).reshape(-1, 2)
+    half = np.array([[b.length_m / 2, b.width_m / 2, b.height_m / 2] for b in boxes]).reshape(-1, 3)
     return Bodies(
         xy.reshape(-1, 2),
         yaw.reshape(-1),
         half[:, 0],
         half[:, 1],
         velocity.reshape(-1, 2),
+        np.full(len(half), np.nan) if z is None else z.reshape(-1),
+        half[:, 2],
     )
 
 

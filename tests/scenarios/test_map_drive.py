@@ -11,8 +11,9 @@ import shapely
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import interpolate
+from alpasim_plugin.core.geometry import interpolate, yaw_from_quat
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.world.ground import ground_poses
 from scenarios.load import load_scenario
 from scenarios.opendrive import read_lanes
 from scenarios.opendrive_road import parse_map
@@ -132,6 +133,34 @@ def test_the_expert_waits_at_the_stop_line_and_who_drives_on_is_caught(tmp_path)
     assert signal.colour_at(int(made.ego_log.t_us[np.searchsorted(front, 90.0)])) != "red"
     on_free_road_us = round((90.0 - front[0]) / 10.0 * 1e6)
     assert signal.colour_at(on_free_road_us) == "red"
+
+
+def test_a_light_that_is_too_near_to_stop_at_is_green_when_the_ego_passes_it(tmp_path):
+    for start_m in (60, 70, 80, 85):
+        made = scenario(tmp_path, two_roads(light("7", 98), STOP), *named(f"1:{start_m}", "2:150"))
+        (signal,) = made.lane_map.signals
+        x = made.ego_log.xyz[:, 0] + made.world_origin[0]
+        front = x + made.vehicle.rear_axle_to_centre_m + made.vehicle.box.length_m / 2
+        passed = int(np.searchsorted(front, 90.0))
+        assert signal.colour_at(int(made.ego_log.t_us[passed])) in ("green", "yellow")
+
+
+@pytest.mark.parametrize(("number", "height_m"), [("1", 0.0), ("2", 7.0)])
+def test_a_drive_under_a_bridge_is_level_and_so_is_one_on_it(tmp_path, number, height_m):
+    over = '<geometry s="0" x="100" y="-100" hdg="1.5707963" length="200"><line/></geometry>'
+    raised = (
+        '</planView><elevationProfile><elevation s="0" a="7" b="0" c="0" d="0"/></elevationProfile>'
+    )
+    parts = (
+        road("1", section(0, *BOTH), length=200),
+        road("2", section(0, *BOTH), length=200, view=over).replace("</planView>", raised),
+    )
+    made = scenario(tmp_path, parts, *named(f"{number}:20", f"{number}:180"))
+    z = made.ego_log.xyz[:, 2] + made.world_origin[2]
+    assert z == pytest.approx(np.full(len(z), height_m), abs=1e-6)
+    poses = ground_poses(made.ground, made.ego_log.xyz[:, :2], yaw_from_quat(made.ego_log.quat))
+    assert poses[:, 2, 3] + made.world_origin[2] == pytest.approx(z, abs=1e-6)
+    assert np.degrees(np.arccos(np.clip(poses[:, 2, 2], -1.0, 1.0))).max() < 1.5
 
 
 def junction_of(*parts):

@@ -121,6 +121,7 @@ class RightOfWay:
             table.velocity[rows],
             table.present[rows] & in_sight,
             tuple(table.boxes),
+            np.full(table.yaw[rows].shape, np.nan),  # the reference line knows no heights
             np.zeros(len(table.boxes), dtype=np.bool_),
         )
         front_s = s_m + self.front_m
