@@ -1,14 +1,16 @@
-"""Parts that end, leave, change or fill their process, twenty ways, each as a policy, a renderer, a
-fixer, an evaluator and a served policy.
+"""Parts that end, leave, change or fill their process, in as many ways as the table has, each as a
+policy, a renderer, a fixer, an evaluator and a served policy.
 
 ``PolicyExit``, ``RendererExit``... are made of the table below.
 """
 
 import ctypes
+import locale
 import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from dataclasses import replace
@@ -87,6 +89,39 @@ def sleep_beside(parent):
         time.sleep(1.0)
 
 
+def start_session(value):
+    parent = os.getpid()
+    if os.fork() == 0:
+        os.setsid()
+        sleep_beside(parent)
+        os._exit(0)
+    return value
+
+
+def change_signals(value):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGCHLD, signal.SIGALRM):
+        signal.signal(number, signal.SIG_IGN)
+    return value
+
+
+def change_environment(value):
+    os.environ.clear()
+    locale.setlocale(locale.LC_ALL, "C")
+    return value
+
+
+def limit_recursion(value):
+    sys.setrecursionlimit(150)
+    return value
+
+
+def remove_folder(value):
+    folder = tempfile.mkdtemp()
+    os.chdir(folder)
+    os.rmdir(folder)
+    return value
+
+
 def change_folder(value):
     os.chdir("/")
     return value
@@ -137,6 +172,11 @@ FAULTS = {
         start_thread,
         fork,
         start_process,
+        start_session,
+        change_signals,
+        change_environment,
+        limit_recursion,
+        remove_folder,
         change_folder,
         patch_library,
         close_files,
@@ -151,6 +191,11 @@ HARMLESS = {
     "start_thread",
     "fork",
     "start_process",
+    "start_session",
+    "change_signals",
+    "change_environment",
+    "limit_recursion",
+    "remove_folder",
     "change_folder",
     "patch_library",
     "close_output",
