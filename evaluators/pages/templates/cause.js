@@ -122,7 +122,7 @@ const chart = ({ name, unit, lines, text }, failed, span) => {
   for (const line of lines) svg.append(svgNode("path", { class: `line ${line.kind}`, d: linePath(line, (t) => share(t, span), y) }));
   const node = make("figure", "curve"), plot = make("div", "plot"), caption = make("figcaption", "small");
   plot.append(svg, make("span", "limit top num", `${shortNumber(high)} ${unit}`), make("span", "limit bottom num", shortNumber(low)));
-  caption.append(make("b", "", name), ...lines.map((line) => make("span", `key ${line.kind}`, line.name)));
+  caption.append(make("b", "", name), ...lines.map((line) => make("span", `line-name ${line.kind}`, line.name)));
   node.append(caption, plot);
   return { node, head };
 };
