@@ -4,8 +4,10 @@ import dataclasses
 
 import pytest
 
+from alpasim_plugin.log.run_folder.manifests import read_manifest, write_manifest
+from alpasim_plugin.log.run_folder.records import DriveEvent
 from alpasim_plugin.runs.reports import failure_cause
-from evaluators.pages.cause import write_cause
+from evaluators.pages.cause import log_so_far, write_cause
 from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import read_run
 from tests.pages.browser import Browser, find_chromium
@@ -29,7 +31,12 @@ def page_of(folder, cameras):
     plan = Plan(renderers=("clean", "3dgs"), scenes=("smoke-straight",), seeds=(0, 1), steps=24)
     plan = dataclasses.replace(plan, harm={"clean": 6.0, "3dgs": 6.0})
     run = read_run(make_watched(folder, plan, cameras=cameras))
-    return write_cause(run, failure_cause(run, worst_failure(run)))
+    worst = worst_failure(run)
+    log = log_so_far(run, worst)
+    place = run.folder / worst.path
+    event = DriveEvent("offroad", int(log.ego.t_us[-4]), 2.0, *log.ego.xyz[-4, :2].tolist())
+    write_manifest(place, dataclasses.replace(read_manifest(place), events=(event,)))
+    return write_cause(run, failure_cause(run, worst))
 
 
 @pytest.mark.parametrize("width", [1280, 390])

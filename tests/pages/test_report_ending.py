@@ -2,6 +2,11 @@
 
 import dataclasses
 
+import pytest
+
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.runs.logged_rollout import named_rollout
 from evaluators.metrics.outcomes import outcomes_of
 from evaluators.pages.terminal import next_command
 from evaluators.statistics.cause import worst_failure
@@ -52,3 +57,18 @@ def test_a_quiet_run_leads_to_its_replay_and_a_failing_policy_to_its_check(
         "policy",
         alone.policies[0],
     ]
+
+
+def test_several_logs_of_one_cell_are_told_apart_by_their_names():
+    row = Rollout("clean", "mine", "curve", 0, "ok")
+    logs = [
+        dataclasses.replace(row, log=name, path=f"rollouts/clean/mine/curve/{name}")
+        for name in ("first", "second")
+    ]
+    assert named_rollout(logs, "clean/mine/curve/second") == logs[1]
+    assert named_rollout(logs, "rollouts/clean/mine/curve/first/") == logs[0]
+    assert named_rollout(logs, "clean/mine/curve/0/first") == logs[0]
+    with pytest.raises(InputError, match="2 logs of it") as refused:
+        named_rollout(logs, "clean/mine/curve/0")
+    assert "clean/mine/curve/first, clean/mine/curve/second" in refused.value.hint
+    assert named_rollout([row], "clean/mine/curve/0") == row
