@@ -20,7 +20,7 @@ NOT_RUN = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
     (
         r"runs/versions|exec:env",
-        "of the challenge's page; tests/docs/test_challenge_page.py runs it",
+        "of the challenge's page; test_challenge_page.py runs it",
     ),
     (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
     (r"onefixer-2b|--device cuda|doctor --gpu", "needs weights of 4 GB, or a GPU"),

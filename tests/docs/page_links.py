@@ -13,6 +13,7 @@ OF_COMMIT = re.compile(r"`python (docs/scripts/\w+\.py)[^`\n]*`\s+at\s+commit\s+
 MENTION = re.compile(r"\bdocs/[\w./-]+\.(?:md|png|jpg|py)\b")
 PROGRAM = re.compile(r"\bpython3? ([\w./-]+\.py)\b")
 MODULE = re.compile(r"\bpython3? -m ([\w.]+)")
+OF_OTHERS = "e2e_challenge/"  # in a clone of AlpaSim, as the page of its challenge says
 AT_COMMIT = re.compile(r"\bat\s+commit\s+([0-9a-f]{8})\b")
 HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.M)
 
@@ -111,7 +112,9 @@ def programs_of(text):
     """Return the files of ours that the commands of a text start, as paths below the repository:
     ``python FILE`` and ``python -m MODULE``; a package stands for its ``__main__``.
     """
-    paths = [path for path in PROGRAM.findall(text) if "/" in path]
+    paths = [
+        path for path in PROGRAM.findall(text) if "/" in path and not path.startswith(OF_OTHERS)
+    ]
     modules = [name for name in MODULE.findall(text) if name.split(".")[0] in STARTED]
     return paths + [f"{name.replace('.', '/')}.py" for name in modules]
 
