@@ -61,6 +61,7 @@ MIN_HORIZON_S = 2.0
 MAX_STEP_S = 0.5
 LATENCY_MS = 100.0  # of a policy query, in the median
 FIRST_POSE_M = 0.5
+USUAL_LAG = 1  # queries, which a filter or a threshold takes
 NEAR_M = 20.0  # a first pose that lies farther away looks like coordinates of the world
 START_US = 1_700_000_000_000_000  # epoch time, so that a policy that counts in float32 fails
 STEP_US = 100_000
@@ -213,7 +214,7 @@ def remarks(plans: Mapping[str, Sequence[Plan]]) -> list[Check]:
         if late is None:
             finding = f"a bend in {source} changed no plan within {STEPS - CHANGE} queries"
             out.append(Check(source, True, finding))
-        elif late > 0:
+        elif late > USUAL_LAG:
             finding = f"a bend in {source} changes the plan {late} queries late"
             out.append(Check("lag", True, finding))
     last = plans[STANDING.name][-1]
