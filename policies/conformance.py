@@ -127,13 +127,21 @@ def direction_fault(plans: Sequence[Plan]) -> str:
 def side_fault(plans: Mapping[str, Sequence[Plan]]) -> str:
     """Check that a bend to the left leads further left than one to the right, and further left than
     straight on where the image alone or the route alone bends.
+
+    Only who drives straight on along a straight road says by a bend that it reads it mirrored; who
+    is carried aside there has another fault.
     """
-    by_m = {"route": _end_m(plans[ROUTE_LEFT.name], plans[STRAIGHT.name])}
+    probes = {"route": (STRAIGHT, ROUTE_LEFT)}
     if {situation.name for situation in IMAGES} <= plans.keys():
-        by_m["image"] = _end_m(plans[IMAGE_LEFT.name], plans[NO_ROUTE.name])
-    mirrored = " and the ".join(source for source, left_m in by_m.items() if left_m < -LEAST_M)
-    if mirrored:
-        return f"where the {mirrored} alone bends left the plan leads further right: it is read mirrored, or y does not point left"
+        probes["image"] = (NO_ROUTE, IMAGE_LEFT)
+    sources = []
+    for source, (straight, left) in probes.items():
+        further_left_m = _end_m(plans[left.name], plans[straight.name])
+        aside_m = float(np.median([plan.xy[-1, 1] for plan in plans[straight.name]]))
+        if further_left_m < -LEAST_M and abs(aside_m) < abs(further_left_m) / 2:
+            sources.append(source)
+    if sources:
+        return f"where the {' and the '.join(sources)} alone bends left the plan leads further right: it is read mirrored, or y does not point left"
     left_m, right_m = (_end_m(plans[road.name]) for road in (LEFT, RIGHT))
     if left_m < right_m - LEAST_M:
         return f"a left-hand road leads to y = {left_m:.1f} m and a right-hand one to y = {right_m:.1f} m: y does not point left"

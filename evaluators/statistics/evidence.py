@@ -50,6 +50,8 @@ BEFORE_US = 6_000_000  # of the failure
 LAST_US = 1_000_000  # of it, about which evidence comes first
 STEP_US = 100_000
 AWAY_M = 1.0  # from the route that the policy received
+TURN_M = 2.0  # of a route beside the ego's axis
+TURNS_SHARE = 0.25  # of it, which a plan that does not turn with it reaches
 STANDS_M = 0.5
 BRAKES_MPS = 0.5  # by which a plan that brakes asks for less, one second ahead
 FASTER = 1.25  # share of the recorded speed from which on the ego is faster, and by how much more
@@ -189,14 +191,40 @@ def failure_facts(failure: Failure) -> list[str]:
     """Return what the driving before a failure, or before an end short of the path's, was: the most
     telling first.
     """
-    facts = [held_plan_fact(failure), speed_fact(failure)]
+    facts = [held_plan_fact(failure)]
     if failure.is_slow:
         facts += [slow_fact(failure), *plan_facts(failure)]
     elif failure.contact is not None:
-        facts += [*contact_facts(failure), side_fact(failure)]
+        facts += [speed_fact(failure), *contact_facts(failure), side_fact(failure)]
+    elif _plans_do_not_turn(failure):
+        # At no speed do such plans lead along the route.
+        facts += [side_fact(failure), *plan_facts(failure), speed_fact(failure)]
     else:
-        facts += [swing_fact(failure), side_fact(failure), *plan_facts(failure)]
+        facts += [speed_fact(failure), swing_fact(failure), side_fact(failure)]
+        facts += plan_facts(failure)
     return [text for text in facts if text]
+
+
+def _plans_do_not_turn(failure: Failure) -> bool:
+    """Tell whether the route turns and no plan of the last second turns with it. Plans of an ego
+    that is too fast for a bend do, though less than the route.
+    """
+    last = [plan for plan in failure.plans if failure.before_s(plan) <= LAST_US * 1e-6]
+    turned = [_turned_share(plan) for plan in last]
+    return bool(turned) and all(share is not None and share < TURNS_SHARE for share in turned)
+
+
+def _turned_share(plan: LoggedPlan) -> float | None:
+    """Return how far beside the ego's axis a plan ends two seconds ahead, as a share of how far the
+    route lies there beside it; negative to the other side, None where the route leads straight on.
+    """
+    route = plan.route[np.isfinite(plan.route).all(axis=1)]
+    if not len(route):
+        return None
+    end = _ahead(plan, 2_000_000)
+    away_m = np.hypot(route[:, 0], route[:, 1])
+    aside_m = float(route[np.abs(away_m - np.hypot(*end)).argmin(), 1])
+    return float(end[1]) / aside_m if abs(aside_m) > TURN_M else None
 
 
 def speed_fact(failure: Failure) -> str:

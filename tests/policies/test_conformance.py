@@ -265,3 +265,27 @@ def test_a_policy_that_resets_itself_with_the_scenarios_route_is_driven_in_every
     report = check_policy("tests.runs.faulty_policies:MirroredImages", load_scenario("smoke/curve"))
     faults = [check.sentence for check in report.checks if not check.ok]
     assert any("mirrored" in fault for fault in faults), faults
+
+
+def ends_aside(**left_m):
+    """Return plans of 40 m by situation, three each, that end so far to the left."""
+    names = ("STRAIGHT", "NO_ROUTE", "IMAGE_LEFT", "ROUTE_LEFT", "LEFT", "RIGHT")
+    plans = {}
+    for name in names:
+        xy = np.array([[0.0, 0.0], [40.0, left_m.get(name, 0.0)]])
+        plan = Plan(0, np.array([0, 4_000_000]), xy, np.zeros(2))
+        plans[getattr(conformance, name).name] = [plan, plan, plan]
+    return plans
+
+
+def test_only_who_drives_straight_on_along_a_straight_road_reads_a_bend_mirrored():
+    mirrored = conformance.side_fault(ends_aside(IMAGE_LEFT=-6.0, LEFT=3.0, RIGHT=-3.0))
+    assert "the image alone bends left" in mirrored
+    both = conformance.side_fault(ends_aside(IMAGE_LEFT=-6.0, ROUTE_LEFT=-4.0))
+    assert "the route and the image alone bends left" in both
+    # Carried to the right on a straight road as well, until it sees none: an image that is cut.
+    aside = ends_aside(NO_ROUTE=-14.0, IMAGE_LEFT=-20.0, STRAIGHT=-14.0, ROUTE_LEFT=-14.0)
+    lost = ends_aside()[conformance.NO_ROUTE.name]
+    for name in (conformance.STRAIGHT.name, conformance.NO_ROUTE.name):
+        aside[name] = [*aside[name], *aside[name], *lost]
+    assert conformance.side_fault(aside) == ""
