@@ -19,7 +19,7 @@ DEGREE = 9
 NODES = 64
 BEYOND_RAD = np.deg2rad(20.0)
 FARTHEST_RAD = np.deg2rad(130.0)
-BELOW_TURN = 0.98  # of the angle at which a lens turns back
+BELOW_TURN = 0.9  # of the angle at which a lens turns back, where its radius still grows
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,7 @@ WIDEST_RAD = np.deg2rad(80.0)  # from the optical axis: beyond it one plane cann
 WIDEST_OF_ONE_RAD = np.deg2rad(50.0)
 WIDEST_OF_PANELS_RAD = np.deg2rad(70.0)
 WIDEST_OF_CUBE_RAD = np.deg2rad(110.0)  # of several planes
+DESCRIBED_RAD = np.deg2rad(135.0)  # as far as a lens is followed beyond what its image shows
 BLEND = 0.02  # difference of the cosines to two pinholes' axes within which both are shown
 MAX_COVER_PX = 6_000_000  # of a covering pinhole; its resolution falls for lenses that need more
 # a ray whose projection misses its pixel by more lies outside what the lens model describes
@@ -411,9 +412,13 @@ def radial_form(camera: CameraSpec) -> RadialForm:
         def radius(angle: F64) -> F64:
             return _inverse(polynomial, angle, reach, camera.name)[0]
 
-        return RadialForm(linear, radius, _grows_to(radius, _limit(lens)), (0.0,) * 6)
+        return RadialForm(linear, radius, _grows_to(radius, DESCRIBED_RAD), (0.0,) * 6)
     polynomial = _radius_of_angle(lens)
-    return RadialForm(linear, lambda angle: _value(polynomial, angle), _growing(lens), (0.0,) * 6)
+
+    def radius(angle: F64) -> F64:
+        return _value(polynomial, angle)
+
+    return RadialForm(linear, radius, _grows_to(radius, DESCRIBED_RAD), (0.0,) * 6)
 
 
 def _grows_to(radius: Callable[[F64], F64], limit: float) -> float:
