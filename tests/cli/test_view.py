@@ -42,7 +42,7 @@ def test_a_rollout_is_shown_beside_the_others_of_its_cell(run, tmp_path, capsys)
     folder = run / "rollouts/3dgs/lane-camera/smoke-straight/0"
     out = tmp_path / "one.html"
     assert run_command(["view", str(folder), "--out", str(out)]) == 0
-    assert "1 of 1 rollouts" in capsys.readouterr().out
+    assert "2 of 2 rollouts" in capsys.readouterr().out  # behind both renderers
     text = out.read_text()
     assert '"scene":"smoke-straight"' in text
     assert "urban-left_turn" not in text[text.index('id="index"') :]

@@ -104,4 +104,6 @@ def test_drive_calls_of_a_driver_are_said_beside_the_challenge_s_budget(run):
     assert not any("drive calls" in text for text in overview_of(driven).cautions)
     timed_run = replace(driven, summary=replace(driven.summary, drive_calls=calls))
     (line,) = [text for text in overview_of(timed_run).cautions if "drive calls" in text]
-    assert "40 drive calls took 3.00 s of the challenge's budget of 4.00 s; 2 took longer" in line
+    assert (
+        "40\u00a0drive calls took 3.00 s of the challenge's budget of 4.00 s; 2 took longer" in line
+    )

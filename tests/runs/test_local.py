@@ -191,14 +191,24 @@ def test_what_a_job_leaves_running_ends_with_its_worker():
     assert all(map(is_gone, left.values()))
 
 
+def lose_a_worker_beside_others(numbers):
+    """Run a job that leaves a process behind as its worker dies, and two others."""
+    jobs = ["a", numbers, "b"]  # one worker of the others lives on
+    results = dict(run_jobs(leave_a_process_or_work, jobs, 2, limit_s=60.0))
+    assert isinstance(results.pop(numbers), Lost)
+    assert results == {"a": "A", "b": "B"}
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="it finds processes in /proc")
 @pytest.mark.parametrize("name", ["numbers", "session"])
 def test_what_a_job_leaves_running_ends_with_a_worker_that_dies(tmp_path, name):
     numbers = tmp_path / name
-    jobs = ["a", str(numbers), "b"]  # one worker of the others lives on
-    results = dict(run_jobs(leave_a_process_or_work, jobs, 2, limit_s=60.0))
-    assert isinstance(results.pop(str(numbers)), Lost)
-    assert results == {"a": "A", "b": "B"}
+    # A process of its own: where workers were forked with another number of threads before, these
+    # would be started anew, and what they leave in a session of its own would have no heir.
+    script = (
+        f"from tests.runs import test_local as t; t.lose_a_worker_beside_others({str(numbers)!r})"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=280)
     left = [int(line) for line in numbers.read_text().split()]
     assert left
     assert all(map(is_gone, left))
