@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from alpasim_plugin.fixers.network.checkpoints import StateDict
 
 FORMAT = "simrun-fixer-1"
+HARDLY = "hardly trained: "
 HARDLY_UPDATES = 50  # from nothing: weights of fewer are marked wherever the fixer is named
 FILES = ("bundle", "dit", "vae", "decoder", "prompt")  # of `WeightsSettings`
 S = TypeVar("S", bound=WeightedSettings)
@@ -103,7 +104,7 @@ def training_words(header: Mapping[str, str]) -> str:
         return "untrained"
     updates = header.get("updates", "")
     if updates.isdecimal() and int(updates) < HARDLY_UPDATES:
-        return f"hardly trained: {_updates(int(updates))}"
+        return f"{HARDLY}{_updates(int(updates))}"
     return "trained"
 
 
@@ -220,7 +221,12 @@ def read_bundle(path: str | Path, settings: WeightedSettings) -> Bundle:
         )
     trained = header.get("trained") == "true"
     words = training_words(header)
-    notes = ["" if words == "trained" else words, header.get("note", ""), *others]
+    note = header.get("note", "")
+    mark = "" if words == "trained" else words
+    # A note that counts the updates itself is not followed by a second count.
+    if mark.startswith(HARDLY) and mark.removeprefix(HARDLY) in note:
+        mark = "hardly trained"
+    notes = [mark, note, *others]
     return Bundle(parts, trained, ", ".join(filter(None, notes)) or "trained")
 
 

@@ -49,7 +49,7 @@ def test_pairs_become_a_bundle_with_its_card(pairs, tmp_path, capsys):
     settings = fixer_settings("onefixer", [f"weights.bundle={document['weights']}"])
     fixer = make_fixer("onefixer", settings, scene_id="scene")
     assert fixer.trained
-    assert fixer.label.startswith("onefixer, 2 updates, ")
+    assert fixer.label.startswith("onefixer, hardly trained, 2 updates, ")
     assert fixer.step([Frame(0, "front", np.zeros((20, 30, 3), dtype=np.uint8))], ())[
         0
     ].rgb.shape == (
