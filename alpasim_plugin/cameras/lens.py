@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -413,12 +414,8 @@ def radial_form(camera: CameraSpec) -> RadialForm:
             return _inverse(polynomial, angle, reach, camera.name)[0]
 
         return RadialForm(linear, radius, _grows_to(radius, DESCRIBED_RAD), (0.0,) * 6)
-    polynomial = _radius_of_angle(lens)
-
-    def radius(angle: F64) -> F64:
-        return _value(polynomial, angle)
-
-    return RadialForm(linear, radius, _grows_to(radius, DESCRIBED_RAD), (0.0,) * 6)
+    radius_at = partial(_value, _radius_of_angle(lens))
+    return RadialForm(linear, radius_at, _grows_to(radius_at, DESCRIBED_RAD), (0.0,) * 6)
 
 
 def _grows_to(radius: Callable[[F64], F64], limit: float) -> float:
