@@ -245,7 +245,7 @@ class TimingSpec(Part):
 
 
 class RouteSpec(Part):
-    """What a policy is told of its route, as 20 points 4.21 m apart."""
+    """The route that a policy receives, as 20 points 4.21 m apart."""
 
     start_offset_m: float = number(
         0, 80, "How far ahead of the ego its points begin; nearer ones are left out.", 0.0
@@ -413,7 +413,7 @@ class ScenarioSpec(Part):
     ) = field("None: the log's own, or one named front.", None)
     rates: RatesSpec = field("Periods of the loop.", RatesSpec())
     timing: TimingSpec = field("Start, length and warm-up.", TimingSpec())
-    route: RouteSpec = field("What a policy is told of its route.", RouteSpec())
+    route: RouteSpec = field("The route that a policy receives.", RouteSpec())
     latency: LatencySpec = field("Delay of the policy.", LatencySpec())
     degradation: DegradationSpec = field("Degradation of the renderer 3dgs.", DegradationSpec())
     background: BackgroundSpec | None = field("A Gaussian file as background.", None)

@@ -138,8 +138,8 @@ def _interleaved(
     first: Sequence[Observation],
     second: Sequence[Observation],
 ) -> tuple[list[Plan], list[Plan]]:
-    """Return the plans of two sessions: at each step both are told what is new, then both are
-    asked.
+    """Return the plans of two interleaved sessions: at each step both receive their observations,
+    then both are asked for a plan.
     """
     plans: tuple[list[Plan], list[Plan]] = ([], [])
     try:

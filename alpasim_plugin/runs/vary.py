@@ -186,7 +186,10 @@ class BoundarySearch:
     def __post_init__(self) -> None:
         ref = self.plan.cells[0].ref
         varied = digest(
-            [[one.key, one.low, one.high, one.spacings, one.parts] for one in self.sweeps]
+            [
+                [sweep.key, sweep.low, sweep.high, sweep.spacings, sweep.parts]
+                for sweep in self.sweeps
+            ]
         )
         self.plan = replace(self.plan, question=varied)
         self.is_area = len(self.sweeps) == 2
@@ -198,7 +201,7 @@ class BoundarySearch:
         self.ref = ref
         names = [(cell.renderer.name, cell.policy.name) for cell in self.plan.cells]
         self.variants = variants_of(names)
-        self.failed = {(one, seed): {} for one in self.variants for seed in self.plan.seeds}
+        self.failed = {(variant, seed): {} for variant in self.variants for seed in self.plan.seeds}
         self.at_once = len(self.failed) * 4
         self.points: dict[str, Point] = {}  # by scene
         self.skipped: set[Point] = set()
@@ -209,7 +212,7 @@ class BoundarySearch:
         the middle of its own.
         """
         sweep = self.sweeps[axis]
-        middle = [one.values[one.steps // 2] for one in self.sweeps]
+        middle = [sweep.values[sweep.steps // 2] for sweep in self.sweeps]
 
         def values(point: int) -> tuple[float, ...]:
             return (*middle[:axis], sweep.values[point], *middle[axis + 1 :])
@@ -238,12 +241,12 @@ class BoundarySearch:
 
     def _values(self, point: Point) -> tuple[float, ...]:
         """Return the values of the parameters at a point."""
-        return tuple(one.values[step] for one, step in zip(self.reached, point, strict=True))
+        return tuple(sweep.values[step] for sweep, step in zip(self.reached, point, strict=True))
 
     def _is_reachable(self, values: tuple[float, ...]) -> bool:
         """Plan the rollouts of the scene with some values, unless it cannot be built."""
         if values not in self.scenes and values not in self.unreachable:
-            texts = [f"{int(one)}" if one.is_integer() else f"{one!r}" for one in values]
+            texts = [f"{int(value)}" if value.is_integer() else f"{value!r}" for value in values]
             name = self.own_id + "".join(POINT + text for text in texts)
             keys = [sweep.key for sweep in self.sweeps]
             more = [f"{key}={text}" for key, text in zip(keys, texts, strict=True)]

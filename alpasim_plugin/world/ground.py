@@ -60,7 +60,7 @@ def from_points(points: F64, cell_m: float = 2.0, drive: F64 | None = None) -> H
     ij = np.floor((xyz[:, :2] - low) / cell_m).astype(np.int64)
     _, inverse, count = np.unique(ij[:, 1] * nx + ij[:, 0], return_inverse=True, return_counts=True)
     # Sums of differences to one point: UTM-sized coordinates keep their last digits.
-    sums = np.stack([np.bincount(inverse, rest) for rest in (xyz - xyz[0]).T], axis=1)
+    sums = np.stack([np.bincount(inverse, offsets) for offsets in (xyz - xyz[0]).T], axis=1)
     means = sums / count[:, None] + xyz[0]
     xs = low[0] + cell_m * np.arange(nx)
     ys = low[1] + cell_m * np.arange(ny)

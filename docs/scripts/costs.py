@@ -88,8 +88,8 @@ def installed_mb() -> float:
 def page_of(record: dict[str, dict[str, float]], text: str) -> str:
     """Return the page with the table of a record."""
     rows = [
-        (what, f"{cost['processor_s']:.0f}", f"{cost['memory_mb']:.0f}", f"{cost['disk_mb']:.0f}")
-        for name, (what, _) in STEPS.items()
+        (step, f"{cost['processor_s']:.0f}", f"{cost['memory_mb']:.0f}", f"{cost['disk_mb']:.0f}")
+        for name, (step, _) in STEPS.items()
         if (cost := record.get(name))
     ]
     head = ("what", "processor seconds", "memory of the largest process, MB", "disk, MB")

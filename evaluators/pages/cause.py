@@ -260,7 +260,7 @@ def _queries(run: Run, cause: Cause, log: RolloutLog, place: Place) -> list[Json
     rollout = cause.rollout
     cameras = log.info["cameras"]
     scale = min(1.0, WIDTH_PX / cameras[0].width) if cameras else 1.0
-    taken = [[one for one in log.images if one.camera == camera.name] for camera in cameras]
+    taken = [[image for image in log.images if image.camera == camera.name] for camera in cameras]
     driven = speeds(log.ego)
     debug_file = run.file_of(rollout, DEBUG_NAME)
     debug = {} if debug_file is None else {row["t_us"]: row for row in read_facts(debug_file)}
@@ -351,7 +351,7 @@ def commands(run: Run, cause: Cause) -> list[tuple[str, str, str]]:
         return [("c", "test the policy alone", check)]
     cell = shlex.quote(f"{run.folder}/{cell_name(*rollout.cell)}")
     at_s = cause.partings[0].at_s if cause.partings else (cause.failed_s or 0.0) - FORK_S
-    others = [one.name for one in cause.partings if one.kind == "renderer"]
+    others = [parting.name for parting in cause.partings if parting.kind == "renderer"]
     other = [*others, "3dgs" if rollout.renderer == "clean" else "clean"][0]
     fork = f"simrun fork {cell} --at {max(0.0, at_s):.1f} --renderer {shlex.quote(other)}"
     view = f"simrun view {shlex.quote(str(run.folder / rollout.path))}"

@@ -128,7 +128,7 @@ def map_data(content: JsonView, log: F64, place: Place) -> JsonObject:
         }  # a border shared by two lanes is drawn once
         return [place.cm(shapely.get_coordinates(shape)) for shape in kept.values()]
 
-    lines = {kind: near(some) for kind, some in drawn_map(content).items()}
+    lines = {kind: near(lines_of_kind) for kind, lines_of_kind in drawn_map(content).items()}
     return {
         "turn": round(chord_angle(log), 4),
         **lines,

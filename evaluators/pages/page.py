@@ -177,7 +177,11 @@ def _notes(
         "Left out": (left, " --scene, --policy and --seed choose."),
         "Not shown, as every rollout failed,": (failed, ""),
     }
-    notes = [f"{why} {_named(some)}.{hint}" for why, (some, hint) in reasons.items() if some]
+    notes = [
+        f"{reason} {_named(left_out)}.{hint}"
+        for reason, (left_out, hint) in reasons.items()
+        if left_out
+    ]
     if stride > 1:
         notes.append(
             f"Every {ORDINALS[stride]} camera frame is kept. Poses, plans and metrics are whole."

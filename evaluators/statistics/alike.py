@@ -84,7 +84,7 @@ def _by_surroundings(
     n_failed_out = len(failed) - n_failed_in
     if not n_out or n_failed_out or n_passed_in:
         return None
-    twins = [
+    passed_on_same_road = [
         other
         for other in passed[:MOST_SCENES]
         if _surroundings(run, other, key) != label and _same_road(run, rollout, other)
@@ -92,17 +92,17 @@ def _by_surroundings(
     elsewhere = sorted(
         {_surroundings(run, other, key) or "elsewhere" for other in passed} - {label}
     )
-    same = f", on the same road in {twins[0].scene}" if twins else ""
+    same = f", on the same road in {passed_on_same_road[0].scene}" if passed_on_same_road else ""
     sentence = (
         f"It fails {label} alone: in {n_failed_in} of {n_failed_in} rollouts {label}, in "
         f"0 of {n_out} {' or '.join(elsewhere)}{same}."
     )
-    return Common(bool(twins) or min(n_failed_in, n_out) >= LEAST_ROLLOUTS, sentence)
+    return Common(bool(passed_on_same_road) or min(n_failed_in, n_out) >= LEAST_ROLLOUTS, sentence)
 
 
 def _same_road(run: Run, rollout: Rollout, other: Rollout) -> bool:
     """Tell whether the recorded drives of two rollouts lead the same way."""
-    paths = [_recorded_xy(run, one.scene) for one in (rollout, other)]
+    paths = [_recorded_xy(run, driven.scene) for driven in (rollout, other)]
     if any(path is None for path in paths):
         return False
     first, second = (path - path[0] for path in paths if path is not None)

@@ -192,11 +192,11 @@ def _evidence(run: Run, rollout: Rollout, failure: Failure | None) -> list[str]:
     common = common_to_failures(run, rollout)
     facts = [] if failure is None else failure_facts(failure)
     return [
-        *(one.sentence for one in common if one.decisive),
+        *(fact.sentence for fact in common if fact.decisive),
         *facts[:1],
         *behind_others(run, rollout),
         *facts[1:],
-        *(one.sentence for one in common if not one.decisive),
+        *(fact.sentence for fact in common if not fact.decisive),
     ]
 
 

@@ -538,5 +538,5 @@ def _beside_m(plan: LoggedPlan) -> float:
     distance_m = float(shapely.distance(line, point))
     along_m = float(shapely.line_locate_point(line, point))
     ends = [shapely.line_interpolate_point(line, max(along_m + d, 0.0)) for d in (-0.5, 0.5)]
-    begin, then = (shapely.get_coordinates(one)[0] for one in ends)
+    begin, then = (shapely.get_coordinates(end_point)[0] for end_point in ends)
     return float(np.copysign(distance_m, cross(then - begin, end - begin)))

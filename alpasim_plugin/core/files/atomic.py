@@ -84,7 +84,7 @@ def is_left_over(name: str, of_any_machine: bool = False) -> bool:
     Args:
         name: Without its folder.
         of_any_machine: Whoever holds the lock of a folder knows that no other machine writes there;
-            else only names that this machine gave are told.
+            else only the names of processes of this machine are recognised.
     """
     matched = TEMPORARY.fullmatch(name)
     if matched is None or not (of_any_machine or matched[2] == _machine()):

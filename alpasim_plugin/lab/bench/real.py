@@ -82,8 +82,8 @@ def unseen_cameras(scenario: Scenario) -> list[str]:
             f"{scenario.scene_id}: no recorded drive: it has no photographs",
             "give a drive that was imported: simrun import drive FOLDER -o OUT",
         )
-    cameras = sorted({one.camera for one in scenario.recording if one.use in SETS})
-    if not cameras or sum(one.use == "fitted" for one in scenario.recording) < 2:
+    cameras = sorted({frame.camera for frame in scenario.recording if frame.use in SETS})
+    if not cameras or sum(frame.use == "fitted" for frame in scenario.recording) < 2:
         raise InputError(
             f"{scenario.scene_id}: no photograph that the fit did not see",
             "import it again: every eighth photograph is held out where there are eight",
