@@ -3,15 +3,13 @@ belong to them; those that ship are in ``configs/settings``.
 """
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files.config import guess, load_yaml, validate
+from alpasim_plugin.core.files.config import guess, load_yaml, own_or_shipped, validate
 from alpasim_plugin.core.json_types import JsonObject
 from evaluators.metrics.presets import PRESETS
 
@@ -47,11 +45,6 @@ class Settings:
     overrides: tuple[str, ...] = ()
 
 
-def shipped_settings() -> list[str]:
-    """Return the names of the settings that ship."""
-    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
-
-
 def load_settings(path_or_name: str | None) -> Settings:
     """Read a settings file, or shipped settings by name; nothing where none is named.
 
@@ -60,14 +53,7 @@ def load_settings(path_or_name: str | None) -> Settings:
     """
     if path_or_name is None:
         return Settings()
-    path = Path(path_or_name)
-    if not os.path.isfile(path):
-        path = LIBRARY / f"{path_or_name}.yaml"
-    if not os.path.isfile(path):
-        raise InputError(
-            f"--settings {path_or_name}: no such file, and no shipped settings have that name",
-            f"{guess(path_or_name, shipped_settings())}name a YAML file, or one of {', '.join(shipped_settings())}",
-        )
+    path = own_or_shipped(path_or_name, LIBRARY, "settings file", "--settings")
     document = load_yaml(path)
     spec = validate(SettingsSpec, document)
     if spec.preset is not None and spec.preset not in PRESETS:

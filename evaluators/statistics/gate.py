@@ -7,7 +7,6 @@ were drawn from (`evaluators.statistics.paired`).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,7 +16,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
-from alpasim_plugin.core.files.config import guess, load_yaml, validate
+from alpasim_plugin.core.files.config import (
+    guess,
+    load_yaml,
+    own_or_shipped,
+    shipped_names,
+    validate,
+)
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
@@ -170,14 +175,7 @@ def load_gate(
         InputError: No such file, bad YAML, an unknown key, metric or preset: with file, line and
             column.
     """
-    path = Path(path_or_name)
-    if not os.path.isfile(path):
-        path = LIBRARY / f"{path_or_name}.yaml"
-    if not os.path.isfile(path):
-        raise InputError(
-            f"{path_or_name}: {'a folder, not a file' if os.path.isdir(path_or_name) else 'no such file'}",
-            f"name a YAML file, or a shipped gate: {', '.join(shipped_gates())}",
-        )
+    path = own_or_shipped(path_or_name, LIBRARY, "gate")
     document = load_yaml(path)
     spec = validate(GateSpec, document)
     for name, rule in spec.metrics.items():
@@ -205,7 +203,7 @@ def load_gate(
 
 def shipped_gates() -> list[str]:
     """Return the names of the gates that come with the package."""
-    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+    return shipped_names(LIBRARY)
 
 
 Kind = Literal["margin", "limit"]

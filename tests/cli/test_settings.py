@@ -5,8 +5,9 @@ import json
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.cli.settings import LIBRARY, load_settings, shipped_settings
+from alpasim_plugin.cli.settings import LIBRARY, load_settings
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.config import shipped_names
 from scenarios.load import load_scenario
 
 SCENE = """
@@ -51,7 +52,7 @@ def test_the_nuplan_track_is_asked_twice_a_second_with_eight_cameras(scene):
     assert scenario.route_offset_m == 40.0
 
 
-@pytest.mark.parametrize("name", shipped_settings())
+@pytest.mark.parametrize("name", shipped_names(LIBRARY))
 def test_every_value_of_shipped_settings_names_its_source(name):
     lines = (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
     assert any("github.com/NVlabs/alpasim" in line and "commit" in line for line in lines)

@@ -460,6 +460,37 @@ def _nearest(name: str, choices: Sequence[str]) -> str:
     return f"{guess(name, choices)}valid: {', '.join(choices)}"
 
 
+def shipped_names(library: Path) -> list[str]:
+    """Return the names of the YAML files that ship in a folder."""
+    return sorted(path.stem for path in library.glob("*.yaml"))
+
+
+def own_or_shipped(path_or_name: str | Path, library: Path, kind: str, option: str = "") -> Path:
+    """Return a user's own YAML file, or the shipped one of that name.
+
+    Args:
+        path_or_name: The file or the name.
+        library: The folder of those that ship.
+        kind: What they are, for the hint: ``gate``.
+        option: The option that names it, for the message: ``--settings``.
+
+    Raises:
+        InputError: Neither is there.
+    """
+    path = Path(path_or_name)
+    if os.path.isfile(path):
+        return path
+    names = shipped_names(library)
+    name = str(path_or_name)
+    if name in names:
+        return library / f"{name}.yaml"
+    problem = "a folder, not a file" if os.path.isdir(path) else "no such file"
+    raise InputError(
+        f"{option} {name}: {problem}".strip(),
+        f"{guess(name, names)}name a YAML file, or a shipped {kind}: {', '.join(names)}",
+    )
+
+
 def guess(name: str, choices: Collection[str]) -> str:
     """Return the beginning of a hint that names the choice nearest to a name; empty where none is
     near.

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files.config import apply_overrides, load_yaml, parse, validate
+from alpasim_plugin.core.files.config import (
+    apply_overrides,
+    load_yaml,
+    own_or_shipped,
+    parse,
+    validate,
+)
 from tests.examples import examples
 
 
@@ -244,3 +250,20 @@ def test_any_text_gives_data_or_a_clear_error(text):
     except InputError as e:
         error = e
     assert error is None or (error.message and error.hint)
+
+
+def test_a_users_own_file_or_a_shipped_one_is_found_by_name(tmp_path):
+    library = tmp_path / "library"
+    library.mkdir()
+    (library / "strict.yaml").write_text("a: 1\n")
+    assert own_or_shipped("strict", library, "gate") == library / "strict.yaml"
+    own = tmp_path / "strict"
+    own.write_text("a: 2\n")
+    assert own_or_shipped(str(own), library, "gate") == own
+    with pytest.raises(InputError, match=r"--gate .*: a folder, not a file"):
+        own_or_shipped(str(library), library, "gate", "--gate")
+    with pytest.raises(InputError, match="strickt: no such file") as refused:
+        own_or_shipped("strickt", library, "gate")
+    assert refused.value.hint.startswith("did you mean 'strict'?")
+    with pytest.raises(InputError):  # a path is no name of a shipped file
+        own_or_shipped("../library/strict", library, "gate")
