@@ -35,15 +35,19 @@ Entry = dict[str, Any]
 
 def read_run(run: Path) -> tuple[str, Entry]:
     """Return the policy of a run, and its numbers: means with half width and bounds, differences
-    with bounds and p-value, and for each family of scenes the rollouts with the event.
+    with bounds and p-value, for each family of scenes the rollouts with the event, and when and by
+    which commit it was driven.
     """
     summary = json.loads((run / "summary.json").read_text())
+    facts = json.loads((run / "run.json").read_text())
     rows = pd.read_parquet(run / "rollouts.parquet")
     rows["family"] = rows["scene"].str.split("-").str[-2].str.replace("_", " ")
     counts = (
         rows.astype({EVENT: float}).groupby(["family", "renderer"])[EVENT].agg(["sum", "count"])
     )
     entry: Entry = {key + "s": rows[key].nunique() for key in ("scene", "seed")}
+    entry["date"] = facts["started_at"][: len("2026-11-25")]
+    entry["commit"] = facts["project"]["commit"][:8]
     for kind, section, names, keys in (
         ("means", "metrics", RENDERERS, ("mean", "ci95", "ci95_clustered")),
         ("minus", "paired", OTHERS, ("diff", "ci95", "p_value")),
@@ -103,7 +107,8 @@ def tables(policy: str, entry: Entry) -> str:
     events = [[family, *(f"{number} of {rollouts}" for number, rollouts in counts.values())]
               for family, counts in entry["events"].items()]  # fmt: skip
     parts = (
-        f"**{policy}**: {entry['scenes']} scenes x {entry['seeds']} seeds\n",
+        f"**{policy}**: {entry['scenes']} scenes x {entry['seeds']} seeds, driven on "
+        f"{entry['date']} by commit {entry['commit']}\n",
         table(["metric", *RENDERERS], means),
         table([f"minus {BASELINE}", *OTHERS], minus),
         table(["left the road or at fault, rollouts", *RENDERERS], events),
@@ -168,7 +173,7 @@ def sentence(entry: Entry, length: str) -> str:
         f"{interval}.\n{over.n_better} families are better and {over.n_worse} worse (sign test, p = "
         f"{over.p_value:.3f}); without the one that moves it most, {over.family}, it is "
         f"{over.without_family:+.1f} points. For families that were not driven the interval is wide: "
-        f"{over.bounds[0]:+.1f} to {over.bounds[1]:+.1f} "
+        f"{over.bounds[0]:+.1f} to {over.bounds[1]:+.1f}. The rollouts were driven on {entry['date']} "
         f"([closed loop](docs/experiments/fixer-closed-loop.md)).\n"
     )
 
