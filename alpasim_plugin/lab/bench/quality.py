@@ -18,7 +18,6 @@ import numpy as np
 import torch
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.parts import PartSpec, build
@@ -31,9 +30,13 @@ from alpasim_plugin.lab.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import CONTENT, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
-from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, available, load_distance
-from alpasim_plugin.lab.video_metrics.lpips import TRUNKS
-from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, shipped_weights
+from alpasim_plugin.lab.video_metrics.image_distance import (
+    ImageDistance,
+    available,
+    digests,
+    load_distance,
+)
+from alpasim_plugin.lab.video_metrics.road import road_mask
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
@@ -42,7 +45,7 @@ from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 4  # of what a row holds and how it is measured; part of its key
+VERSION = 5  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip
@@ -180,7 +183,7 @@ def measure(
 ) -> dict[str, Any]:
     """Return the row of one clip under one variant (`alpasim_plugin.lab.video_metrics.summary`)."""
     truth = None if variant.label == TRUTH else clip.truth
-    quality = clip_quality(result.video, truth, networks)
+    quality = clip_quality(result.video, truth, networks, road_mask(clip.sdmap))
     later_blocks = result.ms_per_frame[1:] or result.ms_per_frame  # the first one is shorter
     return {
         "arm": variant.label,
@@ -210,7 +213,7 @@ class Work:
         frames: First frames of the clip that are measured.
         seed: Of the fixer's noise.
         device, threads: Where the fixer computes, and with how many threads.
-        weights: Folder of LPIPS weights.
+        weights: Folder of the metrics' weights.
         out: Folder of rows and images.
         pictured: Whether some frames are kept for a sheet.
     """
@@ -252,20 +255,9 @@ def row_key(clip: QualityClip, work: Work) -> str:
         work.variant.spec and work.variant.spec.digest,
         work.seed,
         work.device,
-        networks(work.weights),
+        digests(work.weights),
     ]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def networks(folder: Path | None) -> dict[str, str]:
-    """Return the perceptual distances that there are weights for, each with their digest."""
-    digests = {}
-    for name in available(folder):
-        kind: Literal["alex", "vgg"] = "alex" if name == "lpips_alex" else "vgg"
-        digests[name] = (
-            file_sha256(shipped_weights()) if name == NAME else TRUNKS[kind].heads_sha256
-        )
-    return digests
 
 
 def finish(work: Work) -> dict[str, Any]:
@@ -333,7 +325,7 @@ def measure_quality(
             for label, spec in variants.items()
         },
         "units": {label: unit_of(spec) for label, spec in variants.items()},
-        "networks": networks(first.weights),
+        "networks": digests(first.weights),
         "load": os.getloadavg()[0],
         "hardware": hardware(),
         "versions": versions(),

@@ -71,7 +71,9 @@ Overrides = Annotated[
 ]
 Weights = Annotated[
     Path | None,
-    typer.Option("--metric-weights", help=f"Folder of LPIPS weights; also {FOLDER_VARIABLE}."),
+    typer.Option(
+        "--metric-weights", help=f"Folder of the metrics' weights; also {FOLDER_VARIABLE}."
+    ),
 ]
 Pictures = Annotated[
     int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")

@@ -7,11 +7,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alpasim_plugin.core.types import F64, U8
-from alpasim_plugin.lab.video_metrics.facts import DRIFT, GRID, PSNR, SSIM, WARP, WARP_LATE
+from alpasim_plugin.core.types import F64, U8, Bool
+from alpasim_plugin.lab.video_metrics.facts import (
+    DRIFT,
+    GRID,
+    PSNR,
+    SSIM,
+    WARP,
+    WARP_LATE,
+    WARP_LATE_ROAD,
+)
 from alpasim_plugin.lab.video_metrics.frames import psnr_db, ssim
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
-from alpasim_plugin.lab.video_metrics.warp import late_window, warp_l1
+from alpasim_plugin.lab.video_metrics.warp import late_window, warp_errors
 
 SETTLED = slice(50, 100)  # frames with which the end of a long clip is compared
 END = 50  # frames at the end
@@ -42,29 +50,47 @@ class ClipQuality:
         return out if drift is None else {**out, DRIFT: drift}
 
 
-def clip_quality(made: U8, truth: U8 | None, networks: Mapping[str, ImageDistance]) -> ClipQuality:
+def clip_quality(
+    made: U8,
+    truth: U8 | None,
+    networks: Mapping[str, ImageDistance],
+    road: Bool | None = None,
+) -> ClipQuality:
     """Measure one clip.
 
     Args:
         made: ``(T, H, W, 3)``, at least two frames.
         truth: The ground-truth frames; None computes only the metrics without a reference.
         networks: Perceptual distances by name.
+        road: ``(T, H, W)``, the pixels that show the road; None where nothing says so.
 
     Raises:
         EvaluatorError: Videos that do not belong together.
     """
+    warp = warp_errors(made, road)
+    whole = late_road_error(warp.road)
     if truth is None:
-        return ClipQuality({WARP: warp_l1(made)}, 0)
+        return ClipQuality({WARP: warp.whole}, 0, whole)
     series = {PSNR: psnr_db(made, truth), SSIM: ssim(made, truth)}
     series |= {name: image_distances(net, made, truth) for name, net in networks.items()}
-    series[WARP] = warp_l1(made)
-    whole = {}
+    series[WARP] = warp.whole
     for side, name in GRID.items():
         ratio = grid_ratio(made[::GRID_EVERY], truth[::GRID_EVERY], side)
         if ratio is not None:
             whole[name] = ratio
     identical = int(np.sum(np.all(made == truth, axis=(1, 2, 3))))
     return ClipQuality(series, identical, whole)
+
+
+def late_road_error(road_errors: F64 | None) -> dict[str, float]:
+    """Return the mean warp error of the road over the late pairs that show it, by its name; nothing
+    where none does.
+    """
+    if road_errors is None:
+        return {}
+    late = road_errors[late_window(len(road_errors))]
+    on_road = late[~np.isnan(late)]
+    return {WARP_LATE_ROAD: float(on_road.mean())} if len(on_road) else {}
 
 
 def drift_of(psnr: F64 | None) -> float | None:

@@ -9,6 +9,7 @@ PSNR = "psnr_db"
 SSIM = "ssim"
 WARP = "warp_l1"
 WARP_LATE = "warp_l1_late"
+WARP_LATE_ROAD = "warp_l1_late_road"
 MS = "ms_per_frame"
 DRIFT = "drift_psnr_db"
 GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
@@ -31,8 +32,10 @@ FACTS = {
     "perceptual-syn": Fact("", "lower", "perceptual-syn"),
     "lpips_alex": Fact("", "lower", "LPIPS (AlexNet)"),
     "lpips_vgg": Fact("", "lower", "LPIPS (VGG)"),
+    "dists": Fact("", "lower", "DISTS"),
     WARP: Fact("", "lower", "Warp L1 x 1e4", 1, 1e4),
     WARP_LATE: Fact("", "lower", "late Warp L1 x 1e4", 1, 1e4),
+    WARP_LATE_ROAD: Fact("", "lower", "late Warp L1 of the road x 1e4", 1, 1e4),
     DRIFT: Fact("dB", "higher", "drift, dB", 2),
     GRID[4]: Fact("", "lower", "grid of 4", 3),
     GRID[16]: Fact("", "lower", "grid of 16", 3),

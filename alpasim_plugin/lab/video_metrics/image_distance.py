@@ -1,5 +1,5 @@
-"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS, with
-weights from the user.
+"""Perceptual image distances by name: `perceptual-syn`, shipped with the package; LPIPS and
+DISTS, with weights from the user.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.lab.video_metrics import dists
 from alpasim_plugin.lab.video_metrics.frames import check_stacks
-from alpasim_plugin.lab.video_metrics.lpips import Kind, load_lpips, missing_files
-from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, load_perceptual
+from alpasim_plugin.lab.video_metrics.lpips import TRUNKS, Kind, load_lpips, missing_files
+from alpasim_plugin.lab.video_metrics.perceptual_net import NAME, load_perceptual, shipped_weights
 
 FOLDER_VARIABLE = "SIMRUN_METRIC_WEIGHTS"
 KINDS: dict[str, Kind] = {"lpips_alex": "alex", "lpips_vgg": "vgg"}
@@ -44,7 +46,20 @@ def available(folder: str | Path | None = None) -> tuple[str, ...]:
     weights = weights_folder(folder)
     if weights is None:
         return (NAME,)
-    return (NAME, *(name for name, kind in KINDS.items() if not missing_files(kind, weights)))
+    names = [NAME, *(name for name, kind in KINDS.items() if not missing_files(kind, weights))]
+    if not dists.missing_files(weights):
+        names.append(dists.NAME)
+    return tuple(names)
+
+
+def digests(folder: str | Path | None = None) -> dict[str, str]:
+    """Return the SHA-256 of what calibrates every available distance; the names of the trunks'
+    files fix those.
+    """
+    sha256 = {name: TRUNKS[kind].heads_sha256 for name, kind in KINDS.items()}
+    sha256[dists.NAME] = dists.HEADS_SHA256
+    sha256[NAME] = file_sha256(shipped_weights())
+    return {name: sha256[name] for name in available(folder)}
 
 
 def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
@@ -56,12 +71,13 @@ def load_distance(name: str, folder: str | Path | None = None) -> ImageDistance:
     if name == NAME:
         return load_perceptual()
     weights = weights_folder(folder)
-    if name not in KINDS or weights is None:
+    published = (*KINDS, dists.NAME)
+    if name not in published or weights is None:
         raise InputError(
             f"perceptual distance {name!r}: no such distance, or no folder of weights",
-            f"choose {NAME}, or one of {', '.join(KINDS)} with {FOLDER_VARIABLE} set to the folder of its weights",
+            f"choose {NAME}, or one of {', '.join(published)} with {FOLDER_VARIABLE} set to the folder of its weights",
         )
-    return load_lpips(KINDS[name], weights)
+    return dists.load_dists(weights) if name == dists.NAME else load_lpips(KINDS[name], weights)
 
 
 def distance_for_training(folder: str | Path | None = None) -> tuple[str, ImageDistance]:

@@ -185,15 +185,13 @@ def load_lpips(kind: Kind, folder: str | Path) -> LPIPS:
             f"lpips_{kind} from {folder}: not there: {', '.join(missing)}",
             "put the files there (docs/lab/video-metrics.md says where they come from), or use perceptual-syn",
         )
-    digest = file_sha256(folder / plan.file)
-    if not digest.startswith(plan.digest_start):
-        raise InputError(
-            f"{folder / plan.file}: sha256 {digest}, which does not begin with {plan.digest_start}",
-            "copy the file again",
-        )
-    trunk = load_weights(folder / plan.file)
+    state = load_trunk(plan, folder)
     heads = load_weights(folder / plan.heads_file, sha256=plan.heads_sha256)
-    net.load_state_dict(_state(plan, trunk, heads, str(folder)), strict=False)
+    for i, c in enumerate(c for c in plan.convolutions if c.tapped):
+        key = f"lin{i}.model.1.weight"
+        shape = (1, c.outputs, 1, 1)
+        state[f"heads.{i}"] = checked_tensor(heads, key, shape, str(folder)).flatten()
+    net.load_state_dict(state, strict=False)
     return net.requires_grad_(False).eval()
 
 
@@ -206,27 +204,36 @@ def missing_files(kind: Kind, folder: str | Path) -> list[str]:
     ]
 
 
-def _state(plan: Trunk, trunk: StateDict, heads: StateDict, source: str) -> StateDict:
-    """Map published keys to the keys of `LPIPS`.
+def load_trunk(plan: Trunk, folder: Path) -> StateDict:
+    """Return a trunk's published weights under their published keys, ``features.INDEX.weight`` and
+    ``.bias``; the digest is checked before anything is read.
 
     Raises:
-        InputError: One is missing or has another shape.
+        InputError: A missing or modified file, or a tensor that is missing or has another shape.
     """
-    out: StateDict = {}
+    path = folder / plan.file
+    digest = file_sha256(path)
+    if not digest.startswith(plan.digest_start):
+        raise InputError(
+            f"{path}: sha256 {digest}, which does not begin with {plan.digest_start}",
+            "copy the file again",
+        )
+    trunk = load_weights(path)
+    state: StateDict = {}
     for c in plan.convolutions:
         shapes = {"weight": (c.outputs, c.inputs, c.kernel, c.kernel), "bias": (c.outputs,)}
         for part, shape in shapes.items():
-            out[f"features.{c.index}.{part}"] = _tensor(
-                trunk, f"features.{c.index}.{part}", shape, source
-            )
-    for i, c in enumerate(c for c in plan.convolutions if c.tapped):
-        out[f"heads.{i}"] = _tensor(
-            heads, f"lin{i}.model.1.weight", (1, c.outputs, 1, 1), source
-        ).flatten()
-    return out
+            key = f"features.{c.index}.{part}"
+            state[key] = checked_tensor(trunk, key, shape, str(folder))
+    return state
 
 
-def _tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -> Tensor:
+def checked_tensor(tensors: StateDict, key: str, shape: tuple[int, ...], source: str) -> Tensor:
+    """Return one tensor of published weights, in float32.
+
+    Raises:
+        InputError: It is missing, has another shape, or holds values that are not finite.
+    """
     value = tensors.get(key)
     if value is None or tuple(value.shape) != shape:
         problem = "it is missing" if value is None else f"its shape is {tuple(value.shape)}"

@@ -1,16 +1,19 @@
 """Warp L1: how much a video changes beyond its own motion.
 
 The flow from every frame to the one before is estimated on the video itself, so a blurred video
-scores better: read it beside a distance to the truth. The paper takes the late frames of a clip.
+scores better: read it beside a distance to the truth. The paper takes the late frames of a clip and,
+where there is one, the mask of the road.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
-from alpasim_plugin.core.types import F32, F64, U8
+from alpasim_plugin.core.types import F32, F64, U8, Bool
 from alpasim_plugin.lab.video_metrics.frames import check_stack
 
 # The late window is the last third of the pairs, at least 30
@@ -18,8 +21,23 @@ LATE_SHARE = 3
 LATE_LEAST = 30
 
 
+@dataclass(frozen=True)
+class WarpErrors:
+    """Warp errors of the ``T - 1`` pairs of neighbouring frames, 0 to 1."""
+
+    whole: F64  # (T - 1,) over all valid pixels
+    road: F64 | None  # (T - 1,) over those of the road; NaN where a pair shows none
+
+
 def warp_l1(video: U8) -> F64:
-    """Return the warp error of every pair of neighbouring frames.
+    """Return the warp error of every pair of neighbouring frames over the whole image, ``(T - 1,)``
+    (`warp_errors`).
+    """
+    return warp_errors(video).whole
+
+
+def warp_errors(video: U8, road: Bool | None = None) -> WarpErrors:
+    """Return the warp errors of every pair of neighbouring frames.
 
     Farneback flow on grey frames (pyramid 0.5, 3 levels, window 21, 3 iterations, poly_n 5,
     poly_sigma 1.2); the previous frame is sampled where the flow points, bilinear, in float32; mean
@@ -28,23 +46,29 @@ def warp_l1(video: U8) -> F64:
 
     Args:
         video: ``(T, H, W, 3)``, at least two frames.
-
-    Returns:
-        ``(T - 1,)``, 0 to 1.
+        road: ``(T, H, W)``, the pixels of every frame to which the second error is restricted.
 
     Raises:
-        EvaluatorError: Fewer than two frames, or no stack of frames.
+        EvaluatorError: Fewer than two frames, no stack of frames, or a mask of another size.
     """
     check_stack("made", video)
     if len(video) < 2:
         raise EvaluatorError("a video: one frame", "give at least two")
+    if road is not None and road.shape != video.shape[:3]:
+        raise EvaluatorError(
+            f"a road mask {road.shape} of a video {video.shape}", "give a mask for every frame"
+        )
     grey = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video]
-    return np.array(
-        [
-            _pair(video[i - 1], video[i], backward_flow(grey[i], grey[i - 1]))
-            for i in range(1, len(video))
-        ]
-    )
+    whole = []
+    on_road = []
+    for i in range(1, len(video)):
+        flow = backward_flow(grey[i], grey[i - 1])
+        difference, valid = _warped_difference(video[i - 1], video[i], flow)
+        whole.append(_mean_error(difference, valid))
+        if road is not None:
+            chosen = valid & road[i]
+            on_road.append(_mean_error(difference, chosen) if chosen.any() else np.nan)
+    return WarpErrors(np.array(whole), None if road is None else np.array(on_road))
 
 
 def backward_flow(grey: U8, previous: U8) -> F32:
@@ -65,7 +89,10 @@ def late_window(pairs: int) -> slice:
     return slice(max(pairs - max(-(-pairs // LATE_SHARE), LATE_LEAST), 0), None)
 
 
-def _pair(previous: U8, frame: U8, flow: F32) -> float:
+def _warped_difference(previous: U8, frame: U8, flow: F32) -> tuple[F32, Bool]:
+    """Return the absolute difference of a frame from the warped previous one, summed over RGB, and
+    which pixels come from inside the image, ``(H, W)`` each.
+    """
     h, w = frame.shape[:2]
     rows, columns = np.indices((h, w), dtype=np.float32)
     x = columns + flow[..., 0]
@@ -79,5 +106,8 @@ def _pair(previous: U8, frame: U8, flow: F32) -> float:
     warped = cv2.remap(
         previous.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    difference = np.abs(frame.astype(np.float32) - warped).sum(axis=2)
-    return float(difference[valid].mean(dtype=np.float64)) / 765.0
+    return np.abs(frame.astype(np.float32) - warped).sum(axis=2), valid
+
+
+def _mean_error(difference: F32, pixels: Bool) -> float:
+    return float(difference[pixels].mean(dtype=np.float64)) / 765.0

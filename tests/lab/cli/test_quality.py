@@ -67,7 +67,7 @@ def test_a_table_a_document_charts_and_pictures(data, bundle, tmp_path, capsys):
     summary = json.loads(capsys.readouterr().out)
     variants = summary["arms"]
     assert list(variants) == ["3dgs", "identity", "small", "truth"]
-    assert sorted(variants["truth"]) == ["warp_l1", "warp_l1_late"]
+    assert sorted(variants["truth"]) == ["warp_l1", "warp_l1_late", "warp_l1_late_road"]
     for metric in ("psnr_db", "ssim", "perceptual-syn", "warp_l1"):
         assert variants["identity"][metric] == variants["3dgs"][metric]
         assert summary["paired"]["identity"][metric]["diff"] == 0.0

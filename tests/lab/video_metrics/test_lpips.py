@@ -18,6 +18,7 @@ from alpasim_plugin.lab.video_metrics.image_distance import (
     load_distance,
 )
 from alpasim_plugin.lab.video_metrics.lpips import LPIPS, TRUNKS, load_lpips
+from tests.lab.video_metrics.published_files import write_trunk
 
 KINDS = ("alex", "vgg")
 
@@ -55,26 +56,6 @@ def test_identity_symmetry_and_independence_of_the_batch(net):
     assert_close(net.distance(a.flip(0), b.flip(0)), there.flip(0))
 
 
-def write(folder, kind):
-    """Write random weights under the published names; their digests are wrong unless a test says
-    otherwise.
-    """
-    plan = TRUNKS[kind]
-    net = LPIPS(kind)
-    layers = [(f"features.{c.index}", net.features[str(c.index)]) for c in plan.convolutions]
-    trunk = {
-        f"{name}.{part}": getattr(layer, part).detach()
-        for name, layer in layers
-        for part in ("weight", "bias")
-    }
-    heads = {
-        f"lin{i}.model.1.weight": head.detach().view(1, -1, 1, 1)
-        for i, head in enumerate(net.heads)
-    }
-    torch.save(trunk | {"classifier.1.weight": torch.zeros(2, 2)}, folder / plan.file)
-    torch.save(heads, folder / plan.heads_file)
-
-
 def test_missing_weights_are_named_and_no_number_is_made(tmp_path, monkeypatch):
     monkeypatch.delenv(FOLDER_VARIABLE, raising=False)
     with pytest.raises(InputError):
@@ -91,18 +72,9 @@ def test_published_layout_is_read_tensor_by_tensor(tmp_path, monkeypatch):
     """With the digests of made-up files in place of the published ones; everything else is as for a
     user.
     """
-    write(tmp_path, "alex")
-    plan = TRUNKS["alex"]
-    digest = file_sha256(tmp_path / plan.file)
-    named = f"alexnet-owt-{digest[:8]}.pth"
-    (tmp_path / plan.file).rename(tmp_path / named)
-    monkeypatch.setitem(
-        TRUNKS,
-        "alex",
-        replace(plan, file=named, heads_sha256=file_sha256(tmp_path / plan.heads_file)),
-    )
+    plan = write_trunk(tmp_path, "alex", monkeypatch)
     net = load_lpips("alex", tmp_path)
-    stored = torch.load(tmp_path / named, weights_only=True)
+    stored = torch.load(tmp_path / plan.file, weights_only=True)
     for c in plan.convolutions:
         assert torch.equal(net.features[str(c.index)].weight, stored[f"features.{c.index}.weight"])
     assert available(tmp_path) == ("perceptual-syn", "lpips_alex")

@@ -6,7 +6,10 @@ import pytest
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, warp_l1
+from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
+from alpasim_plugin.lab.video_metrics.clip import clip_quality
+from alpasim_plugin.lab.video_metrics.road import road_mask
+from alpasim_plugin.lab.video_metrics.warp import backward_flow, late_window, warp_errors, warp_l1
 
 RNG = stream("video", 0, "warp")
 
@@ -47,3 +50,53 @@ def test_late_window_is_the_last_third_but_at_least_thirty(pairs, first):
 def test_one_frame_has_no_motion_to_follow():
     with pytest.raises(EvaluatorError):
         warp_l1(texture(32, 32)[None])
+
+
+def test_error_of_the_road_leaves_out_what_flickers_beside_it():
+    video = np.repeat(texture(64, 96)[None], 40, axis=0)
+    video[:, :20] = RNG.integers(0, 256, (40, 20, 96, 3))  # the sky flickers
+    road = np.zeros(video.shape[:3], dtype=bool)
+    road[:, 44:] = True
+    errors = warp_errors(video, road)
+    assert np.array_equal(errors.whole, warp_l1(video))
+    assert errors.road.max() < 0.02 * errors.whole.min()
+    everything = warp_errors(video, np.ones_like(road))
+    assert np.array_equal(everything.road, everything.whole)
+
+
+def test_late_road_error_is_over_the_pairs_that_show_a_road_and_absent_without_a_map():
+    video = np.repeat(texture(32, 48)[None], 40, axis=0)
+    video[25:] = video[25:] // 2 + RNG.integers(0, 99, (15, 32, 48, 3), dtype=np.uint8)
+    road = np.ones(video.shape[:3], dtype=bool)
+    road[25:] = False
+    whole = clip_quality(video, None, {}).means
+    assert "warp_l1_late_road" not in whole
+    quiet = clip_quality(video, None, {}, road).means["warp_l1_late_road"]
+    assert quiet == pytest.approx(warp_l1(video)[9:24].mean(), rel=1e-6)
+    assert quiet < whole["warp_l1_late"]
+    assert "warp_l1_late_road" not in clip_quality(video, None, {}, ~np.ones_like(road)).means
+    with pytest.raises(EvaluatorError, match="road mask"):
+        warp_errors(video, road[:3])
+
+
+def test_road_lies_between_the_outermost_markings_however_faded():
+    sdmap = np.zeros((1, 40, 128, 3), dtype=np.uint8)
+    for row, fade in ((10, 0.1), (20, 0.5), (30, 1.0)):
+        sdmap[0, row, 50 - row] = np.rint(np.array(COLOURS["road_boundary"]) * fade)
+        sdmap[0, row, 60 + row] = np.rint(np.array(COLOURS["line_white"]) * fade)
+    road = road_mask(sdmap)[0]
+    assert [int(road[row].sum()) for row in (10, 15, 20, 30)] == [31, 0, 51, 71]
+    assert not road_mask(np.zeros_like(sdmap)).any()
+
+
+def test_a_road_user_is_no_road_and_its_grey_edges_are_no_paint():
+    sdmap = np.zeros((1, 20, 128, 3), dtype=np.uint8)
+    sdmap[0, 10, 10:60:49] = COLOURS["road_boundary"]
+    sdmap[0, 5:15, 20:30] = BOX_COLOURS["car"][0]
+    sdmap[0, 5:15, 90:100] = BOX_COLOURS["truck"][1]
+    sdmap[0, 5:15, 100] = COLOURS["box_edge"]
+    road = road_mask(sdmap)[0]
+    assert not road[:, 60:].any()
+    assert not road[10, 20:30].any()
+    assert road[10, 10:20].all()
+    assert road[10, 30:60].all()
