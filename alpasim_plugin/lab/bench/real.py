@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.lab.bench.colour_video_vdp import ColourVideoVDP
 from alpasim_plugin.lab.bench.lane_paint import PaintCounts, Road, compare_paint, road_of
+from alpasim_plugin.lab.bench.open_loop import TrueImage
 from alpasim_plugin.lab.bench.photograph import posed_photograph
 from alpasim_plugin.lab.video_metrics.image_distance import ImageDistance, image_distances
 from alpasim_plugin.lab.video_metrics.warp import warp_l1
@@ -134,6 +135,24 @@ def _to_segment(a: F64, b: F64, place: F64) -> float:
     return float(np.linalg.norm(a + t * along - place))
 
 
+def series_of(shots: Mapping[str, Sequence[Shot]]) -> dict[str, list[TrueImage]]:
+    """Return photographs as what a policy is asked with."""
+    return {
+        name: [
+            TrueImage(
+                shot.photograph.t_us,
+                shot.photograph.use,
+                shot.photograph.T_world_camera,
+                shot.camera.K,
+                shot.rgb,
+                shot.distance_m,
+            )
+            for shot in taken
+        ]
+        for name, taken in shots.items()
+    }
+
+
 def measure_drive(
     name: str,
     scenario: Scenario,
@@ -153,21 +172,73 @@ def measure_drive(
     Raises:
         InputError: Nothing to measure, or a renderer of blocks of frames.
     """
+    shots = shots_of(scenario)
+    return image_rows(name, shots, rendered_shots(scenario, renderers, shots, report), judges)
+
+
+def rendered_shots(
+    scenario: Scenario,
+    renderers: Mapping[str, Callable[[], Renderer]],
+    shots: Mapping[str, Sequence[Shot]],
+    report: Report | None = None,
+) -> dict[str, dict[str, list[U8]]]:
+    """Return by renderer and camera what is shown where each photograph was taken, in order of time.
+
+    Raises:
+        InputError: A renderer of blocks of frames.
+    """
+    requests = {
+        camera: [request_of(scenario, shot) for shot in taken] for camera, taken in shots.items()
+    }
+    return rendered_images(renderers, requests, report)
+
+
+def rendered_images(
+    renderers: Mapping[str, Callable[[], Renderer]],
+    requests: Mapping[str, Sequence[RenderRequest]],
+    report: Report | None = None,
+) -> dict[str, dict[str, list[U8]]]:
+    """Return by renderer and camera the images of requests, which are in order of time; every camera
+    gets a session of its own.
+
+    Raises:
+        InputError: A renderer of blocks of frames.
+    """
     tell = report or (lambda subject, done, all: None)
     for make in renderers.values():  # before anything is rendered
         _refuse_blocks(make())
-    shots = shots_of(scenario)
-    rows = []
+    images: dict[str, dict[str, list[U8]]] = {}
     for renderer, make in renderers.items():
+        images[renderer] = {}
+        for camera, camera_requests in requests.items():
+            session = make()
+            frames = []
+            for number, request in enumerate(camera_requests, start=1):
+                frames.append(session.render(request).rgb)
+                tell(f"{renderer}, {camera}", number, len(camera_requests))
+            images[renderer][camera] = frames
+    return images
+
+
+def image_rows(
+    name: str,
+    shots: Mapping[str, Sequence[Shot]],
+    images: Mapping[str, Mapping[str, Sequence[U8]]],
+    judges: Judges,
+) -> list[Row]:
+    """Return a row for each renderer, camera, set of photographs and distance.
+
+    Args:
+        name: Of the drive, for its rows.
+        shots: Photographs by camera.
+        images: By renderer and camera, what it shows in the place of each.
+        judges: Networks.
+    """
+    rows = []
+    for renderer, images_by_camera in images.items():
         for camera, taken in shots.items():
-            made = _rendered(
-                scenario,
-                make(),
-                taken,
-                lambda done, r=renderer, c=camera, n=len(taken): tell(f"{r}, {c}", done, n),  # type: ignore[misc]
-            )
             for use in SETS:
-                rows += _rows(name, renderer, camera, use, taken, made, judges)
+                rows += _rows(name, renderer, camera, use, taken, images_by_camera[camera], judges)
     return rows
 
 
@@ -182,17 +253,6 @@ def _refuse_blocks(renderer: Renderer) -> None:
             f"{type(renderer).__name__}: a renderer of blocks of frames",
             "name renderers that make one frame at a time",
         )
-
-
-def _rendered(
-    scenario: Scenario, renderer: Renderer, taken: Sequence[Shot], tell: Callable[[int], None]
-) -> list[U8]:
-    """Return an image for each photograph."""
-    frames = []
-    for i, shot in enumerate(taken):
-        frames.append(renderer.render(request_of(scenario, shot)).rgb)
-        tell(i + 1)
-    return frames
 
 
 def request_of(scenario: Scenario, shot: Shot) -> RenderRequest:

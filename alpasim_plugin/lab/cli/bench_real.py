@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Renderer
-from alpasim_plugin.core.parts import RendererSpec, resolve_renderer, split_names
+from alpasim_plugin.core.parts import (
+    PartSpec,
+    RendererSpec,
+    resolve,
+    resolve_renderer,
+    split_names,
+)
 from alpasim_plugin.core.printing import say_document
-from alpasim_plugin.core.types import Scenario
+from alpasim_plugin.core.types import U8, CameraSpec, Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
+from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
+from alpasim_plugin.lab.bench.open_loop import TrueImage, sensors_of
+from alpasim_plugin.lab.bench.plan_gap import gap_intervals, gap_rows
 from alpasim_plugin.lab.bench.real import (
     Judges,
     Row,
+    image_rows,
     intervals,
-    measure_drive,
+    rendered_images,
+    rendered_shots,
+    series_of,
+    shots_of,
     unseen_cameras,
 )
 from alpasim_plugin.lab.cli.bench_rows import print_rows
@@ -35,18 +49,43 @@ Examples:
 - `simrun bench real runs/street --renderer 3dgs,onefixer`
 
 - `simrun bench real runs/street runs/avenue --renderer 3dgs,onefixer --json`: with intervals over the drives
+
+- `simrun bench real runs/street --policy learned`: and how far its plans move
+
+- `simrun bench real hard/sharp_s_curve --policy learned --offsets 0,0.5,1`: in a built scene, beside its path
 """
 EVERY = 10  # frames between lines of progress
+MOST_OFFSET_M = 10.0
+TRUTH = "clean"  # of a built scene
+KEY_OF_TRUTH = "the truth"  # no name of a renderer
 
 
 def real(
     drives: Annotated[
-        list[Path], typer.Argument(help="Folders of imported drives, or their scenario files.")
+        list[Path],
+        typer.Argument(help="Folders of imported drives, or their scenario files; see --offsets."),
     ],
     renderers: Annotated[
         str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")
     ] = "3dgs,onefixer",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
+    policies: Annotated[
+        str,
+        typer.Option(
+            "--policy",
+            help="Comma-separated policies: how far their plans move when they see the renderer in place of the photograph.",
+        ),
+    ] = "",
+    offsets: Annotated[
+        str,
+        typer.Option(
+            "--offsets",
+            metavar="M,M...",
+            help="Metres to the left of the path, for built scenes, whose truth is clean; by default 0.",
+        ),
+    ] = "",
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Seed of the noise of fixers and policies.")
+    ] = 0,
     device: Annotated[
         Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")
     ] = "cpu",
@@ -63,36 +102,224 @@ def real(
     a second camera.
 
     PSNR, SSIM, perceptual-syn, ColorVideoVDP (where cvvdp is installed), Warp L1, and precision and
-    recall of lane markings.
+    recall of lane markings; with --policy the distance between plans made of photographs and of
+    renders.
     """
     del debug
-    specs = {name: resolve_renderer(name) for name in _names(renderers)}
-    scenarios = _loaded(drives)
-    for scenario in scenarios.values():
-        unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
-    vdp, why_not = load_metric()
-    judges = Judges(load_distance(NAME), vdp)
     console = Console(stderr=True)
-    if why_not:
-        console.print(why_not, highlight=False)
-    rows: list[Row] = []
-    for name, scenario in scenarios.items():
-        makers = {
-            part: _maker(spec, scenario, seed, device, threads) for part, spec in specs.items()
-        }
-        rows += measure_drive(name, scenario, makers, judges, partial(_tell, console, name))
-    over = intervals(rows)
-    if len(scenarios) == 1:
+    bench = _Bench(
+        {name: resolve_renderer(name) for name in _names("--renderer", renderers)},
+        [resolve("policy", name) for name in _names("--policy", policies)] if policies else [],
+        seed,
+        device,
+        threads,
+        console,
+    )
+    scenarios = _loaded(drives)
+    built = {name: drive for name, drive in scenarios.items() if drive.model is None}
+    offsets_m = _offsets(offsets)
+    _refuse_mixtures(scenarios, built, bench.policies, offsets)
+    recorded = {name: drive for name, drive in scenarios.items() if name not in built}
+    for scenario in recorded.values():
+        unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
+    images: list[Row] = []
+    gaps: list[dict[str, Any]] = []
+    if recorded:
+        judges = _judges(console)
+        for name, scenario in recorded.items():
+            image_part, gap_part = bench.measure(name, scenario, judges)
+            images += image_part
+            gaps += gap_part
+    for name, scenario in built.items():
+        gaps += bench.measure_built(name, scenario, offsets_m)
+    _say(images, gaps, len(scenarios), as_json, console)
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What is measured, and how."""
+
+    renderers: Mapping[str, RendererSpec]
+    policies: Sequence[PartSpec]
+    seed: int
+    device: str
+    threads: int | None
+    console: Console
+
+    def measure(
+        self, name: str, scenario: Scenario, judges: Judges
+    ) -> tuple[list[Row], list[dict[str, Any]]]:
+        """Return the rows of images and of plans of a drive with photographs."""
+        shots = shots_of(scenario)
+        rendered = rendered_shots(
+            scenario, self._makers(scenario), shots, partial(_tell, self.console, name)
+        )
+        return image_rows(name, shots, rendered, judges), self._gaps(
+            name, scenario, series_of(shots), rendered
+        )
+
+    def measure_built(
+        self, name: str, scenario: Scenario, offsets_m: Sequence[float]
+    ) -> list[dict[str, Any]]:
+        """Return the rows of plans of a built scene, at every offset from its path."""
+        rows = []
+        for offset_m in offsets_m:
+            for policy in self.policies:
+                cameras = _cameras_of(policy, scenario)
+                requests = {
+                    camera.name: offset_requests(scenario, camera, offset_m) for camera in cameras
+                }
+                truth = resolve_renderer(TRUTH)
+                makers = {**self._makers(scenario), KEY_OF_TRUTH: self._maker(truth, scenario)}
+                subject = f"{name}, {offset_m:g} m"
+                rendered = rendered_images(makers, requests, partial(_tell, self.console, subject))
+                series = drawn_series(requests, rendered.pop(KEY_OF_TRUTH), offset_m)
+                rows += [
+                    {**row, "offset_m": offset_m}
+                    for row in self._gaps_of(policy, name, scenario, series, rendered)
+                ]
+        return rows
+
+    def _gaps(
+        self,
+        name: str,
+        scenario: Scenario,
+        series: Mapping[str, Sequence[TrueImage]],
+        rendered: Mapping[str, Mapping[str, Sequence[U8]]],
+    ) -> list[dict[str, Any]]:
+        rows = []
+        for policy in self.policies:
+            rows += self._gaps_of(policy, name, scenario, series, rendered)
+        return rows
+
+    def _gaps_of(
+        self,
+        policy: PartSpec,
+        name: str,
+        scenario: Scenario,
+        series: Mapping[str, Sequence[TrueImage]],
+        rendered: Mapping[str, Mapping[str, Sequence[U8]]],
+    ) -> list[dict[str, Any]]:
+        rows, notes = gap_rows(name, scenario, policy, series, rendered, self.seed)
+        for note in notes:
+            self.console.print(f"{name}: {note}", highlight=False)
+        return rows
+
+    def _makers(self, scenario: Scenario) -> dict[str, Callable[[], Renderer]]:
+        return {name: self._maker(spec, scenario) for name, spec in self.renderers.items()}
+
+    def _maker(self, spec: RendererSpec, scenario: Scenario) -> Callable[[], Renderer]:
+        return lambda: make_renderer(spec, scenario, self.seed, self.device, self.threads)
+
+
+def _say(
+    images: Sequence[Row],
+    gaps: Sequence[dict[str, Any]],
+    drives: int,
+    as_json: bool,
+    console: Console,
+) -> None:
+    """Print rows and their intervals."""
+    if drives == 1:
         console.print(
-            "one drive: no interval; how these numbers vary from drive to drive is not known",
+            "one drive: no interval over drives; how these numbers vary from drive to drive is not known",
             highlight=False,
         )
+    parts = {
+        "rows": images,
+        "intervals": intervals(images),
+        "plan_gap": gaps,
+        "plan_gap_intervals": gap_intervals(gaps),
+    }
     if as_json:
-        say_document({"rows": rows, **({"intervals": over} if over else {})})
+        say_document({name: rows for name, rows in parts.items() if rows})
         return
-    print_rows(rows, False)
-    if over:
-        print_rows([{**row, "median_ci95": _range_text(row["median_ci95"])} for row in over], False)
+    for rows in parts.values():
+        if rows:
+            print_rows([_with_ranges(row) for row in rows], False)
+
+
+def _with_ranges(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row for the terminal, with intervals as texts."""
+    return {
+        name: _range_text(value) if name.endswith("ci95") else value for name, value in row.items()
+    }
+
+
+def _judges(console: Console) -> Judges:
+    vdp, why_not = load_metric()
+    if why_not:
+        console.print(why_not, highlight=False)
+    return Judges(load_distance(NAME), vdp)
+
+
+def _cameras_of(policy: PartSpec, scenario: Scenario) -> list[CameraSpec]:
+    """Return the cameras of a policy.
+
+    Raises:
+        InputError: It has none, or the scenario lacks one.
+    """
+    names = [sensor.camera for sensor in sensors_of(policy, scenario)]
+    cameras = {camera.name: camera for camera in scenario.cameras}
+    lacking = [name for name in names if name not in cameras]
+    if lacking or not names:
+        raise InputError(
+            f"--policy {policy.name}: "
+            + (
+                f"{scenario.scene_id} has no camera {', '.join(lacking)}"
+                if lacking
+                else "it has no camera, so that no image changes its plans"
+            ),
+            "name a policy whose cameras the scene has, for example learned",
+        )
+    return [cameras[name] for name in names]
+
+
+def _refuse_mixtures(
+    scenarios: Mapping[str, Scenario],
+    built: Mapping[str, Scenario],
+    policies: Sequence[PartSpec],
+    offsets: str,
+) -> None:
+    """Refuse built scenes without a policy, and offsets of recorded drives.
+
+    Raises:
+        InputError: There are such.
+    """
+    if built and not policies:
+        scenario = next(iter(built.values()))
+        raise InputError(
+            f"{scenario.scene_id}: no recorded drive: it has no photographs",
+            "give a drive that was imported (simrun import drive FOLDER -o OUT), or name a policy with --policy: its plans behind clean are then the truth",
+        )
+    recorded = [name for name in scenarios if name not in built]
+    if offsets and recorded:
+        raise InputError(
+            f"--offsets {offsets}: {recorded[0]} is a recorded drive: it has photographs where its cameras were, and no others",
+            "leave --offsets out, or give built scenes",
+        )
+
+
+def _offsets(text: str) -> list[float]:
+    """Return metres from their text.
+
+    Raises:
+        InputError: One is no number, twice there, or too large.
+    """
+    try:
+        offsets_m = [float(part) for part in text.split(",")] if text else [0.0]
+    except ValueError:
+        offsets_m = []
+    if (
+        not offsets_m
+        or len(set(offsets_m)) < len(offsets_m)
+        or not all(abs(offset_m) <= MOST_OFFSET_M for offset_m in offsets_m)
+    ):
+        raise InputError(
+            f"--offsets {text}: not numbers, each once and at most {MOST_OFFSET_M:g} m",
+            "write for example 0,0.25,0.5",
+        )
+    return offsets_m
 
 
 def _range_text(bounds: Sequence[float] | None) -> str | None:
@@ -103,30 +330,25 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
     out: dict[str, Scenario] = {}
     for drive in drives:
         file = drive / "scenario.yaml" if drive.is_dir() else drive
-        name = file.parent.name
+        scenario = load_scenario(str(file))
+        name = scenario.scene_id if scenario.model is None else file.parent.name
         if name in out:
             raise InputError(
                 f"{drive}: two drives called {name!r}",
                 "name each folder once, and give folders different names",
             )
-        out[name] = load_scenario(str(file))
+        out[name] = scenario
     return out
 
 
-def _names(text: str) -> list[str]:
+def _names(option: str, text: str) -> list[str]:
     names = split_names(text)
     if not names or len(set(names)) < len(names):
         raise InputError(
-            f"--renderer {text}: no renderer, or one twice",
-            "write for example 3dgs,onefixer",
+            f"{option} {text}: no name, or one twice",
+            "write for example --renderer 3dgs,onefixer or --policy learned,lane-camera",
         )
     return names
-
-
-def _maker(
-    spec: RendererSpec, scenario: Scenario, seed: int, device: str, threads: int | None
-) -> Callable[[], Renderer]:
-    return lambda: make_renderer(spec, scenario, seed, device, threads)
 
 
 def _tell(console: Console, drive: str, subject: str, done: int, all: int) -> None:
