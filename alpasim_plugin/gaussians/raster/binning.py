@@ -20,9 +20,9 @@ LOW_HALF = np.int64(0xFFFFFFFF)
 
 
 @kernel
-def sorted_pairs(keys, width):
-    """Return keys with their numbers, ``key << 32 | number``, by key, equal ones by number; and
-    whether two keys are equal.
+def sorted_numbers(keys, width):
+    """Return the numbers of keys, by key, equal ones by number; and the places of those in that
+    order whose key is that of a neighbour.
 
     A radix sort, which takes a third of the time of a sort by comparisons.
 
@@ -33,6 +33,7 @@ def sorted_pairs(keys, width):
     passes = max(1, (width + RADIX_BITS - 1) // RADIX_BITS)
     bits = max(1, (width + passes - 1) // passes)
     size = 1 << bits
+    # Pairs ``key << 32 | number``
     source = np.empty(keys.shape[0], dtype=np.int64)
     target = np.empty(keys.shape[0], dtype=np.int64)
     places = np.zeros((passes, size), dtype=np.int64)
@@ -53,10 +54,18 @@ def sorted_pairs(keys, width):
             target[places[step, digit]] = source[i]
             places[step, digit] += 1
         source, target = target, source
-    has_ties = False
-    for i in range(1, keys.shape[0]):
-        has_ties |= (source[i] >> 32) == (source[i - 1] >> 32)
-    return source, has_ties
+    tied = np.empty(keys.shape[0], dtype=np.int64)
+    n_tied = 0
+    is_like_last = False
+    for i in range(keys.shape[0]):
+        key = source[i] >> 32
+        is_like_next = i + 1 < keys.shape[0] and key == source[i + 1] >> 32
+        if is_like_last or is_like_next:
+            tied[n_tied] = i
+            n_tied += 1
+        is_like_last = is_like_next
+        target[i] = source[i] & LOW_HALF
+    return target, tied[:n_tied]
 
 
 @inlined_kernel
@@ -91,8 +100,9 @@ def tile_boxes(records, tiles_x, tiles_y, boxes):
 
 
 @kernel
-def count_tiles(cursor, chunk_size, boxes, changes):
-    """Count, per chunk of ``chunk_size`` boxes in the order of depth, how many meet each tile.
+def count_tiles(cursor, chunk_size, order, by_record, boxes, changes):
+    """Put boxes in the order of depth and count, per chunk of ``chunk_size`` of them, how many meet
+    each tile.
 
     ``changes`` has a row and a column more than the tiles. Its sums along both are the counts,
     since a box adds one at its first corner and takes it off past its ends.
@@ -101,13 +111,23 @@ def count_tiles(cursor, chunk_size, boxes, changes):
         chunk = v.fetch_add(cursor, 0, 1)
         if chunk >= changes.shape[0]:
             return
-        corners = changes[chunk]
-        corners[:] = 0
-        for left, right, top, bottom in boxes[chunk * chunk_size : (chunk + 1) * chunk_size]:
-            corners[top, left] += 1
-            corners[top, right] -= 1
-            corners[bottom, left] -= 1
-            corners[bottom, right] += 1
+        for row in range(changes.shape[1]):
+            for column in range(changes.shape[2]):
+                changes[chunk, row, column] = 0
+        for rank in range(chunk * chunk_size, min((chunk + 1) * chunk_size, order.shape[0])):
+            splat = order[rank]
+            left = by_record[splat, 0]
+            right = by_record[splat, 1]
+            top = by_record[splat, 2]
+            bottom = by_record[splat, 3]
+            boxes[rank, 0] = left
+            boxes[rank, 1] = right
+            boxes[rank, 2] = top
+            boxes[rank, 3] = bottom
+            changes[chunk, top, left] += 1
+            changes[chunk, top, right] -= 1
+            changes[chunk, bottom, left] -= 1
+            changes[chunk, bottom, right] += 1
 
 
 @kernel

@@ -29,7 +29,7 @@ from alpasim_plugin.gaussians.constants import (
     POSE_TURN,
     TILE,
 )
-from alpasim_plugin.gaussians.raster.binning import LOW_HALF, count_tiles, fill_tiles, sorted_pairs
+from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, sorted_numbers
 from alpasim_plugin.gaussians.raster.prepared import Node
 
 WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
@@ -91,13 +91,11 @@ def depth_order(depths: F32, ids: I64) -> I64:
     Bits of depths sort as the depths do, which are not negative. The result does not depend on the
     order in which threads wrote the records.
     """
-    bits = depths.view(np.int32)
+    bits = np.ascontiguousarray(depths).view(np.int32)
     keys = bits - bits.min(initial=np.iinfo(np.int32).max)
-    pairs, has_ties = sorted_pairs(keys, int(keys.max(initial=0)).bit_length())
-    order = np.asarray(pairs & LOW_HALF, dtype=np.int64)
-    if has_ties:
-        is_like_next = np.diff(pairs >> 32) == 0
-        tied = np.flatnonzero(np.r_[is_like_next, False] | np.r_[False, is_like_next])
+    order: I64
+    order, tied = sorted_numbers(keys, int(keys.max(initial=0)).bit_length())
+    if len(tied):
         splats = order[tied]
         # Equal depths lie side by side, so the tied ones alone, sorted again, fill their places.
         order[tied] = splats[np.lexsort((ids[splats], keys[splats]))]
@@ -136,12 +134,11 @@ def list_boxes(
     # At most 64 chunks of at least 8192 splats: enough to share out, few enough to keep their tile
     # counts small.
     chunk_size = max(8192, -(-count // 64))
-    # A box is eight bytes, which are moved at once.
-    boxes = by_record.view(np.int64)[order].view(np.int16)
+    boxes = np.empty_like(by_record)
     changes = np.empty((-(-count // chunk_size), tiles_y + 1, tiles_x + 1), dtype=np.int32)
     workers = min(threads, max(1, len(changes) // 4))  # a millisecond of work for each
     cursor = np.zeros(1, dtype=np.int64)
-    run_on_threads(workers, count_tiles, cursor, chunk_size, boxes, changes)
+    run_on_threads(workers, count_tiles, cursor, chunk_size, order, by_record, boxes, changes)
     counts = changes.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1, tiles_x * tiles_y)
     starts = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     before = np.cumsum(counts, axis=0) - counts
