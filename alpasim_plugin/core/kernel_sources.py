@@ -28,11 +28,13 @@ def sources_digest(file: str) -> str:
     return hashed.hexdigest()
 
 
-def sources_of(file: str, root: Path = ROOT) -> set[str]:
+@lru_cache(maxsize=256)
+def sources_of(file: str, root: Path = ROOT) -> frozenset[str]:
     """Return the paths of a file, of the modules below a root whose names its kernels use, and so
     on from those names.
 
-    A module that is used as a whole (``from package import module``) counts with all its names.
+    A module that is used as a whole (``from package import module``) counts with all its names. A
+    process reads each module once.
     """
     start = os.path.realpath(file)
     module = _module(start, os.path.realpath(root))
@@ -43,7 +45,7 @@ def sources_of(file: str, root: Path = ROOT) -> set[str]:
         if place not in visited:
             visited.add(place)
             todo += _module(place[0], os.path.realpath(root)).used_by(place[1])
-    return {path for path, _ in visited}
+    return frozenset(path for path, _ in visited)
 
 
 @dataclass(frozen=True)
@@ -83,25 +85,21 @@ def _module(path: str, root: str) -> _Module:
     kernels: list[str] = []
     for node in tree.body:
         is_defined = isinstance(node, ast.FunctionDef | ast.ClassDef)
-        for inner in () if is_defined else ast.walk(node):  # also below `if` and `try`
+        below = list(ast.walk(node))
+        for inner in () if is_defined else below:  # also below `if` and `try`
             if isinstance(inner, ast.Import | ast.ImportFrom):
                 imported |= dict(_imports(inner, root))
             if isinstance(inner, ast.ImportFrom) and inner.module == MAKERS:
                 makers |= {alias.asname or alias.name for alias in inner.names}
-        words = {word.id for word in ast.walk(node) if isinstance(word, ast.Name)}
-        for name in _names_bound(node):
+        named = [word for word in below if isinstance(word, ast.Name)]
+        words = {word.id for word in named}
+        stored = [word.id for word in named if isinstance(word.ctx, ast.Store)]
+        names = [node.name] if isinstance(node, ast.FunctionDef | ast.ClassDef) else stored
+        for name in names:
             bound[name] = bound.get(name, set()) | words
             if words & makers:
                 kernels.append(name)
     return _Module(path, bound, imported, tuple(kernels))
-
-
-def _names_bound(node: ast.stmt) -> list[str]:
-    """Return the names that a statement binds."""
-    if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        return [node.name]
-    stored = (word for word in ast.walk(node) if isinstance(word, ast.Name))
-    return [word.id for word in stored if isinstance(word.ctx, ast.Store)]
 
 
 def _imports(node: ast.Import | ast.ImportFrom, root: str) -> Iterator[tuple[str, tuple[str, str]]]:
