@@ -401,6 +401,7 @@ def _let_followers_decide(
         everybody,
         np.full(len(cars), FOLLOWED_M),
         row_of_car,
+        lets_merge=True,
     )
     for car, leader, row in zip(cars, leaders, row_of_car.tolist(), strict=True):
         car.decide(leader, everybody, row, t_us)

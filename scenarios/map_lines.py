@@ -66,7 +66,7 @@ def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
     """Return the driven path as one lane of usual width, without markings: nothing says where lines
     were.
     """
-    line = thinned(ego.xyz[:, :2], 0.5)
+    line = ego.xyz[thinned(ego.xyz, 0.5), :2]
     if len(line) == 1:
         line = np.stack([line[0], line[0] + matrix_from_quat(ego.quat[0])[:2, 0]])
     first = line[1] - line[0]

@@ -22,7 +22,7 @@ from alpasim_plugin.core.recorded_state import ego_state_from_log
 from alpasim_plugin.core.types import Observation, Plan, Scenario, read_only
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.renderer import make_renderer
-from alpasim_plugin.world.route import from_offset, route_in_rig
+from alpasim_plugin.world.route import RouteAhead, from_offset
 
 COMMAND = "exec:"  # before a command that simrun starts
 QUERIES = 8  # of a session
@@ -106,15 +106,18 @@ def _recorded(scene: Scenario, wanted: Collection[str], skipped: int) -> list[Ob
     renderer = make_renderer("clean", scene)
     cameras = {camera.name: camera for camera in scene.cameras if camera.name in wanted}
     log = scene.ego_log
+    route_ahead = RouteAhead(scene.route)
     observations = []
-    for step in range(skipped, skipped + QUERIES):
+    for step in range(skipped + QUERIES):
         now = scene.start_us + step * scene.rates.policy_us
         ego = ego_state_from_log(log, now, scene.vehicle)
+        route = from_offset(route_ahead.in_rig(ego.T_world_rig), scene.route_offset_m)
+        if step < skipped:
+            continue
         times = np.unique([*log.t_us[log.t_us <= now], now])
         history = trajectory_from_poses(times, interpolate(log, times))
         requests = [r for r in recorded_requests(scene, now) if r.camera.name in wanted]
         frames = {r.camera.name: read_only(renderer.render(r)) for r in requests}
-        route = from_offset(route_in_rig(scene.route, ego.T_world_rig), scene.route_offset_m)
         observations.append(Observation(now, frames, cameras, ego, history, route))
     return observations
 

@@ -43,7 +43,7 @@ from alpasim_plugin.core.types import (
 )
 from alpasim_plugin.world.actors import ActorForecast, Actors
 from alpasim_plugin.world.ground import ground_pose
-from alpasim_plugin.world.route import from_offset, route_in_rig
+from alpasim_plugin.world.route import RouteAhead, from_offset
 
 
 def visible_actors(actors: Mapping[str, F64]) -> Mapping[str, F64]:
@@ -118,6 +118,7 @@ class LoopState:
     _t_us: I64
     _xyz: F64
     _quat: F64
+    _route_ahead: RouteAhead
     _filled: int = 0
     frames: dict[str, Frame] = field(default_factory=dict)
 
@@ -129,12 +130,16 @@ class LoopState:
         log = scenario.ego_log
         context = int(np.searchsorted(log.t_us, scenario.start_us))
         size = context + n_steps + 1
+        route_ahead = RouteAhead(scenario.route)
+        for pose in interpolate(log, log.t_us[:context]):
+            route_ahead.follow(pose)
         state = cls(
             scenario,
             ego_state_from_log(log, scenario.start_us, scenario.vehicle),
             np.concatenate([log.t_us[:context], np.zeros(size - context, dtype=np.int64)]),
             np.concatenate([log.xyz[:context], np.zeros((size - context, 3))]),
             np.concatenate([log.quat[:context], np.zeros((size - context, 4))]),
+            route_ahead,
             context,
         )
         state._append_pose()
@@ -162,8 +167,7 @@ class LoopState:
             read_only(self.ego),
             read_only(self.history),
             from_offset(
-                route_in_rig(self.scenario.route, self.ego.T_world_rig),
-                self.scenario.route_offset_m,
+                self._route_ahead.in_rig(self.ego.T_world_rig), self.scenario.route_offset_m
             ),
             {name: self.frames[name].image() for name in tensors},
         )

@@ -3,7 +3,7 @@ closed.
 
 Replayed actors exist exactly during their track; some wait for the ego on it. Reactive drivers follow their track until the loop
 closes, then drive along the same line, on along the lanes where it ends, and leave the scene at the
-end of the map.
+end of the map. Where a track turns back on itself, as into a parking place, they stop and stand.
 """
 
 from __future__ import annotations
@@ -20,16 +20,20 @@ from alpasim_plugin.core.geometry import (
     se2,
     se3,
     slerp,
+    unit,
     wrap_angle,
+    yaw_from_quat,
     yaw_of,
 )
 from alpasim_plugin.core.types import (
     F64,
+    I64,
     Actor,
     EgoState,
     HeightField,
     LaneMap,
     Scenario,
+    Trajectory,
     Vehicle,
 )
 from alpasim_plugin.world.ground import STACKED_M, ground_pose
@@ -56,6 +60,7 @@ MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows i
 LINE_STEP_M = 0.5  # poses nearer to each other than this say nothing about a track's direction
 EXTENSION_M = 300.0
 MAX_TURN_RAD = 0.8
+FOLD = -0.5  # cosine between two steps of a track, below which it turns back on itself
 FADE_M = 20.0
 FADE_STEP_M = 2.0
 SPEED_SPAN_US = 100_000
@@ -92,12 +97,13 @@ class Actors:
         self.closed_us = closed_us
         reactive = [actor for actor in actors if actor.behaviour.kind in DRIVING]
         index = LaneIndex(lane_map) if lane_map is not None and reactive else None
-        self.drivers = [_Driver(actor, index, ground, lane_map) for actor in reactive]
+        self.drivers = [_Driver(actor, index, ground, lane_map, closed_us) for actor in reactive]
         for number, driver in enumerate(d for d in self.drivers if d.path is not None):
             driver.line = number
         paths = [driver.path for driver in self.drivers if driver.path is not None]
         self._lines = Lines(paths) if paths else None
         self.replayed = _Tracks([a for a in actors if a.behaviour.kind not in DRIVING])
+        self._on_tracks = _Tracks([d.actor for d in self.drivers if d.path is None])
         self.reset()
 
     def reset(self) -> None:
@@ -124,21 +130,15 @@ class Actors:
         replayed, poses, velocity = self.replayed.at(t_us, self.walkers)
         out = {actor.actor_id: pose for actor, pose in zip(replayed, poses, strict=True)}
         if self._lines is not None and self.t_us is not None and t_us > self.closed_us:
-            bodies = bodies_from(
-                poses[:, :2, 3],
-                heading_of(poses[:, :2, 0]),
-                [actor.box for actor in replayed],
-                velocity,
-                poses[:, 2, 3],
-            )
+            waiting = _bodies_of(*self._on_tracks.at(t_us, {}))
             yaw = yaw_of(ego.T_world_rig)
             direction = direction_of(yaw)
             centre = ego.T_world_rig[:2, 3] + self.vehicle.rear_axle_to_centre_m * direction
             height_m = ego.T_world_rig[2:3, 3] + self.vehicle.box.height_m / 2
-            reactive = bodies_from(
+            ego_body = bodies_from(
                 centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction, height_m
             )
-            others = concatenate([reactive, bodies])
+            others = concatenate([ego_body, _bodies_of(replayed, poses, velocity), waiting])
             self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
         for driver in self.drivers:
             pose = driver.pose(t_us, self.closed_us, driver.motion)
@@ -186,11 +186,13 @@ class Actors:
                 everybody,
                 np.array([driver.horizon_m(motion) for driver, motion in driving]),
                 np.arange(len(others.xy), len(everybody.xy)),
+                lets_merge=True,
             )
             first_moving = len(others.xy)
             for row, ((driver, motion), leader) in enumerate(zip(driving, leaders, strict=True)):
                 accel_mps2 = driver.accel_mps2(motion, leader, everybody, first_moving + row, to_us)
-                driver.move(motion, accel_mps2, dt_s)
+                if motion.since_us <= from_us:
+                    driver.move(motion, accel_mps2, dt_s)
 
 
 @dataclass(frozen=True)
@@ -314,6 +316,17 @@ class _Tracks:
         return [piece.actor for piece in pieces], poses, velocity_mps
 
 
+def _bodies_of(actors: Sequence[Actor], poses: F64, velocity_mps: F64) -> Bodies:
+    """Return road users with poses ``(N, 4, 4)`` and velocities ``(N, 2)`` as bodies."""
+    return bodies_from(
+        poses[:, :2, 3],
+        heading_of(poses[:, :2, 0]),
+        [actor.box for actor in actors],
+        velocity_mps,
+        poses[:, 2, 3],
+    )
+
+
 @dataclass
 class _Motion:
     """Where a reactive driver is on its line."""
@@ -321,6 +334,43 @@ class _Motion:
     s_m: float
     speed_mps: float
     offset_m: float  # left of the line, kept
+    since_us: int  # when it left its track
+
+
+@dataclass(frozen=True)
+class _TrackLine:
+    """A track as a line without time, as far as it can be driven forwards.
+
+    Attributes:
+        xyz: ``(N, 3)`` metres, world.
+        t_us: ``(N,)`` when the track is there.
+        folds: Whether the track turns back on itself behind the line.
+    """
+
+    xyz: F64
+    t_us: I64
+    folds: bool
+
+    @classmethod
+    def of(cls, track: Trajectory) -> _TrackLine:
+        """Return the line of a track up to where it first turns back on itself."""
+        kept = thinned(track.xyz, LINE_STEP_M)
+        steps = unit(np.diff(track.xyz[kept, :2], axis=0))
+        turns_back = np.flatnonzero(np.sum(steps[1:] * steps[:-1], axis=1) < FOLD)
+        if len(turns_back):
+            kept = kept[: turns_back[0] + 2]
+        return cls(track.xyz[kept], track.t_us[kept], len(turns_back) > 0)
+
+    def is_driven(self, heading_rad: float, from_us: int) -> bool:
+        """Return whether a vehicle that heads as the track does at its begin can drive along the line
+        from a time on: forwards, farther than `MIN_PATH_M`, and not yet at the fold.
+        """
+        away_m = np.hypot(*(self.xyz[:, :2] - self.xyz[0, :2]).T)
+        if float(away_m.max()) < MIN_PATH_M:
+            return False
+        begins = self.xyz[1, :2] - self.xyz[0, :2]
+        forwards = float(begins @ direction_of(heading_rad)) >= 0.0
+        return forwards and not (self.folds and from_us >= self.t_us[-1])
 
 
 class _Driver:
@@ -332,18 +382,19 @@ class _Driver:
         index: LaneIndex | None,
         ground: HeightField | None,
         lane_map: LaneMap | None,
+        closed_us: int,
     ) -> None:
         self.actor = actor
         self.ground = ground
         self.act = actor.behaviour.params if actor.behaviour.kind == "adversary" else None
         self.params = IdmParams(**({} if self.act else actor.behaviour.params))
-        line = thinned(actor.track.xyz, LINE_STEP_M)
+        line = _TrackLine.of(actor.track)
+        self.stands_at_end = line.folds
         self.path: Path | None = None
-        if len(line) > 1 and np.hypot(*(line[-1, :2] - line[0, :2])) >= MIN_PATH_M:
-            path = polyline_path(line)
-            end, heading = path.at(path.length_m)
-            ahead = _lanes_ahead(index, end, float(heading)) if index is not None else None
-            self.path = path if ahead is None else polyline_path(np.concatenate([line, ahead]))
+        takeover_us = max(closed_us, int(actor.track.t_us[0]))
+        if line.is_driven(float(yaw_from_quat(actor.track.quat[0])), takeover_us):
+            self.path = _with_lanes_ahead(line, index)
+            self._vertex_us = line.t_us
         self.lights: tuple[LightAhead, ...] = ()
         self.give_way: tuple[LightAhead, ...] = ()
         self.wanted_mps: F64 | None = None
@@ -364,12 +415,26 @@ class _Driver:
         if from_us > last:
             self.present = False  # the track ended while the log was forced
             return
-        takeover_us = max(from_us, first)
+        # Who comes into the scene within the step is then where its track is at the end of it.
+        takeover_us = from_us if first <= from_us else min(to_us, last)
         lo = max(first, takeover_us - SPEED_SPAN_US)
         hi = min(last, takeover_us + SPEED_SPAN_US)
-        s, d = self.path.project(interpolate(self.actor.track, [takeover_us, lo, hi])[:, :2, 3])
-        speed = float(s[2] - s[1]) / ((hi - lo) * 1e-6) if hi > lo else 0.0
-        self.motion = _Motion(float(s[0]), max(0.0, speed), float(d[0]))
+        s_m, offset_m = self._place_on_track(takeover_us)
+        ahead_m = self._place_on_track(hi)[0] - self._place_on_track(lo)[0]
+        speed_mps = ahead_m / ((hi - lo) * 1e-6) if hi > lo else 0.0
+        since_us = from_us if first <= from_us else to_us
+        self.motion = _Motion(s_m, max(0.0, speed_mps), offset_m, since_us)
+
+    def _place_on_track(self, t_us: int) -> tuple[float, float]:
+        """Return where the track is at a time: arc length on the driver's line and offset to its
+        left. A track may pass the same place several times.
+        """
+        assert self.path is not None
+        stations = self.path.s[: len(self._vertex_us)]
+        about_m = np.interp(
+            t_us - self._vertex_us[0], self._vertex_us - self._vertex_us[0], stations
+        )
+        return self.path.project_about(interpolate(self.actor.track, t_us)[:2, 3], float(about_m))
 
     def horizon_m(self, motion: _Motion) -> float:
         """Return how far the driver looks: twice the wanted gap behind a standing leader, beyond
@@ -396,6 +461,8 @@ class _Driver:
             red_gap_m(self.lights, front_m, speed_mps, t_us),
             give_way_gap_m(self.give_way, self.path, front_m, bodies, row),
         )
+        if self.stands_at_end:
+            stop_m = min(stop_m, self.path.length_m - motion.s_m + self.params.min_gap_m)
         return min(behind, idm_acceleration(speed_mps, stop_m, speed_mps, params))
 
     def _against_ego_mps2(self, motion: _Motion, bodies: Bodies, act: Mapping[str, float]) -> float:
@@ -403,8 +470,8 @@ class _Driver:
         ``gap_m`` ahead of the ego, within bounds of its speed; from there on it takes another speed.
         """
         assert self.path is not None
-        act_xy = interpolate(self.actor.track, round(act["act_us"]))[None, :2, 3]
-        act_s_m, ego_s_m = (float(self.path.project(xy)[0][0]) for xy in (act_xy, bodies.xy[:1]))
+        act_s_m, _ = self._place_on_track(round(act["act_us"]))
+        ego_s_m = float(self.path.project(bodies.xy[:1])[0][0])
         wanted_mps = act["end_speed_mps"]
         if motion.s_m < act_s_m:
             front_m = ego_s_m + float(bodies.half_length_m[0]) + act["gap_m"]
@@ -417,9 +484,11 @@ class _Driver:
         return min(max(accel, -act["decel_mps2"]), MAX_ACCEL_MPS2)
 
     def move(self, motion: _Motion, accel_mps2: float, dt_s: float) -> None:
-        """Drive on; the driver leaves the scene at the end of its line."""
+        """Drive on; the driver leaves the scene at the end of its line, or stands there."""
         motion.s_m, motion.speed_mps = moved_on(motion.s_m, motion.speed_mps, accel_mps2, dt_s)
         assert self.path is not None
+        if motion.s_m > self.path.length_m and self.stands_at_end:
+            motion.s_m, motion.speed_mps = self.path.length_m, 0.0
         if motion.s_m > self.path.length_m:
             self.present = False
             self.motion = None
@@ -436,7 +505,7 @@ class _Driver:
             )
             return interpolate(self.actor.track, t_us) if on_track else None
         assert self.path is not None
-        if motion.s_m > self.path.length_m:
+        if motion.s_m > self.path.length_m and not self.stands_at_end:
             return None
         xyz, yaw = self.path.at(motion.s_m, motion.offset_m)
         if self.ground is None:
@@ -448,6 +517,16 @@ class _Driver:
         ):  # the line runs on a bridge above that ground, or below
             return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         return T
+
+
+def _with_lanes_ahead(line: _TrackLine, index: LaneIndex | None) -> Path:
+    """Return the path of a track's line, and on along the lanes unless the track folds there."""
+    path = polyline_path(line.xyz)
+    if index is None or line.folds:
+        return path
+    end, heading = path.at(path.length_m)
+    ahead = _lanes_ahead(index, end, float(heading))
+    return path if ahead is None else polyline_path(np.concatenate([line.xyz, ahead]))
 
 
 def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:

@@ -123,6 +123,10 @@ class Leader:
 NO_LEADER = Leader(float("inf"), 0.0, -1)
 
 LEVEL_M = 1.25  # a line and the nearest face of a body on its level are no farther apart in height
+BESIDE_M = 2.0  # a body whose rear is so far behind the own front bumper is beside
+MERGE_S = 2.0  # who comes into the corridor from beside within this time is let in
+MERGE_MPS = 0.3  # sideways, at least
+SAME_WAY = 0.5  # cosine between a body and the line that it drives along
 BEHIND_M = 15.0  # a body is looked for so far behind the own front bumper
 _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -192,12 +196,15 @@ def find_leaders(
     horizon_m: F64,
     own_row: I64,
     margin_m: float = 0.2,
+    lets_merge: bool = False,
 ) -> list[Leader]:
     """Return the leader of each of many drivers: the nearest body that reaches into the corridor of
     its line ahead of its front bumper.
 
     A body counts when it is on the line's level, its outline overlaps ``+-(half_width_m + margin_m)`` across the line and its
-    rear end is not more than 2 m behind the own front bumper, so that touching bodies still count.
+    rear end is not more than `BESIDE_M` behind the own front bumper, so that touching bodies still count.
+    With ``lets_merge`` a longer body beside counts too that drives the same way, has its nose ahead, and
+    reaches into the corridor or will within `MERGE_S`; until it does, the gap is that to its nose.
 
     Args:
         lines: All lines.
@@ -208,6 +215,7 @@ def find_leaders(
         horizon_m: ``(N,)`` how far each driver looks.
         own_row: ``(N,)`` rows of the drivers in ``bodies``, -1 where they are not among them.
         margin_m: Added to the half width.
+        lets_merge: Whether drivers let in who merges from beside.
     """
     start, _ = lines.at(line, front_s_m)
     delta = bodies.xy - start[:, None, :2]
@@ -219,13 +227,44 @@ def find_leaders(
     reach = half_width_m + margin_m
     span = spans(lines, line[driver], bodies, body, low[driver], high[driver])
     gap_m = span.rear - front_s_m[driver]
-    ahead = (span.low < reach[driver]) & (span.high > -reach[driver])
-    ahead &= span.on_level & (gap_m > -2.0) & (gap_m < horizon_m[driver])
+    inside = (span.low < reach[driver]) & (span.high > -reach[driver])
+    ahead = inside & span.on_level & (gap_m > -BESIDE_M) & (gap_m < horizon_m[driver])
+    if lets_merge:
+        nose_m = span.front - front_s_m[driver]
+        beside = np.flatnonzero(span.on_level & (gap_m <= -BESIDE_M) & (nose_m > 0.0))
+        yaw_and_velocity = (bodies.yaw[body[beside]], bodies.velocity[body[beside]])
+        near_m = _least_offsets(lines, line[driver[beside]], span, beside, *yaw_and_velocity)
+        merges = near_m < reach[driver[beside]]
+        ahead[beside[merges]] = True
+        comes_in = merges & ~inside[beside]
+        gap_m[beside[comes_in]] = nose_m[beside[comes_in]]
     out = [NO_LEADER] * len(line)
     for k in np.lexsort((body, gap_m))[::-1]:  # the nearest last
         if ahead[k]:
             out[driver[k]] = Leader(float(gap_m[k]), float(span.speed[k]), int(body[k]))
     return out
+
+
+def _least_offsets(
+    lines: Lines, line: I64, span: Spans, beside: I64, yaw: F64, velocity: F64
+) -> F64:
+    """Return how near ``(B,)`` to their lines bodies come within `MERGE_S`, metres; infinite for those
+    that do not drive along them.
+
+    Args:
+        lines: All lines.
+        line: ``(B,)`` the one of each body.
+        span: Where bodies are on lines.
+        beside: ``(B,)`` rows of the bodies in ``span``.
+        yaw, velocity: ``(B,)`` and ``(B, 2)`` of the bodies.
+    """
+    _, line_yaw = lines.at(line, (span.rear[beside] + span.front[beside]) / 2)
+    left_mps = velocity[:, 1] * np.cos(line_yaw) - velocity[:, 0] * np.sin(line_yaw)
+    moved_m = MERGE_S * np.where(np.abs(left_mps) > MERGE_MPS, left_mps, 0.0)
+    low = span.low[beside] + np.minimum(moved_m, 0.0)
+    high = span.high[beside] + np.maximum(moved_m, 0.0)
+    is_along = np.cos(yaw - line_yaw) > SAME_WAY
+    return np.where(is_along, np.maximum(np.maximum(low, -high), 0.0), np.inf)
 
 
 def bodies_from(

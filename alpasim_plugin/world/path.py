@@ -13,6 +13,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, cross, direction_of, heading_of, step_lengths
 from alpasim_plugin.core.types import F64, I64, Bool
 
+ABOUT_M = 5.0  # a place whose arc length is nearly known is looked for so far to both sides
 CONNECTOR_STEP_M = 0.5  # between stations of a lane through a junction
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -178,6 +179,17 @@ class Path:
         )
         return self.s[i] + along, across
 
+    def project_about(self, xy: F64, about_m: float) -> tuple[float, float]:
+        """Return `project` of one point ``(2,)`` onto the part of the path within `ABOUT_M` of an arc
+        length: a path may pass the same place several times.
+        """
+        low, high = np.searchsorted(self.s, [about_m - ABOUT_M, about_m + ABOUT_M])
+        low = min(max(int(low) - 1, 0), len(self.s) - 2)
+        near = slice(low, max(int(high) + 1, low + 2))
+        part = Path(self.s[near], self.xyz[near], self.yaw[near], self.curvature[near])
+        s_m, offset_m = part.project(xy[None])
+        return float(s_m[0]), float(offset_m[0])
+
 
 def _from_station(
     offset: F64, yaw: F64, curvature: F64, is_first: Bool, is_last: Bool
@@ -273,15 +285,15 @@ class Lines:
         return dx * dx + dy * dy
 
 
-def thinned(line: F64, step_m: float) -> F64:
-    """Return the points of a polyline ``(N, 2+)`` that are farther than a step from the last one
-    that is kept, the first always.
+def thinned(line: F64, step_m: float) -> I64:
+    """Return the indices of the points of a polyline ``(N, 2+)`` that are farther than a step from
+    the last one that is kept, the first always.
     """
     kept = [0]
     for i in range(1, len(line)):
         if np.hypot(*(line[i, :2] - line[kept[-1], :2])) > step_m:
             kept.append(i)
-    return line[kept]
+    return np.array(kept, dtype=np.int64)
 
 
 def polyline_path(xyz: F64) -> Path:

@@ -5,6 +5,8 @@ carried on past its end.
 made with it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,6 +172,12 @@ MATCH_RADIUS_M = (
 )
 MAX_HEADING_ERROR_RAD = np.pi / 3
 HEADING_WEIGHT_M = 3.0
+# Places of a route that fit the ego's by no more than this worse than the best one are as good, and
+# of several passes of a street the first counts.
+SAME_PASS_M = 1.0
+REACH_M = 5.0  # beside twice what the ego has moved: how far along the route it may have come
+LEFT_M = 4.0  # from the route: it is looked for anywhere
+FOUND_M = 2.0  # where it is this near
 
 
 def route_from_log(
@@ -290,31 +298,138 @@ def _change_cost(index: LaneIndex, old: str, new: str) -> float:
     return 4.0 if new in (lane.left_neighbour, lane.right_neighbour) else 12.0
 
 
-def route_in_rig(route: Route, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
+def route_in_rig(
+    route: Route,
+    T_world_rig: F64,
+    n: int = 20,
+    spacing_m: float = 80 / 19,
+    about_m: float | None = None,
+) -> F64:
     """Return the route ahead ``(n, 3)`` in the rig frame, z = 0, with NaN rows after the route's
     end.
 
     The first point is the ego's projection on the route. Where the route passes the same place
     twice, the pass that runs in the ego's direction counts: one radian of heading error weighs as
-    much as `HEADING_WEIGHT_M` of distance.
+    much as `HEADING_WEIGHT_M` of distance. Of passes in the same direction it is the first, or the
+    one within `REACH_M` of ``about_m``; `RouteAhead` follows a drive from pass to pass.
+
+    Args:
+        route: Where to go.
+        T_world_rig: ``(4, 4)`` where the ego is.
+        n: Number of points.
+        spacing_m: Between points, along the route.
+        about_m: Arc length near which the ego is; None: not known.
+    """
+    if len(route.xyz) < 2:
+        return np.full((n, 3), np.nan)
+    places = _PlacesOnRoute.near(route.xyz, T_world_rig)
+    if about_m is None:
+        begin_m, _ = places.first_pass()
+    else:
+        begin_m, _ = places.within(about_m - REACH_M, about_m + REACH_M)
+    return _sampled(places, T_world_rig, begin_m, n, spacing_m)
+
+
+class RouteAhead:
+    """The route ahead of an ego that drives along it. Where it is along the route is state, so that
+    a street that the route passes twice is left each time as the route leaves it.
+
+    Args:
+        route: Where to go. At the first place the ego is on the route's first pass of it.
+    """
+
+    def __init__(self, route: Route) -> None:
+        self._route = route
+        self._last: tuple[float, F64] | None = None
+
+    def follow(self, T_world_rig: F64) -> None:
+        """Move along the route with the ego: as far as it can have come since the last call. Where
+        the ego has left the route and meets it again, the nearest place of the whole route counts.
+        """
+        if len(self._route.xyz) >= 2:
+            self._moved_to(T_world_rig)
+
+    def in_rig(self, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
+        """Follow the ego and return the route ahead of it; see `route_in_rig`."""
+        if len(self._route.xyz) < 2:
+            return np.full((n, 3), np.nan)
+        places, begin_m = self._moved_to(T_world_rig)
+        return _sampled(places, T_world_rig, begin_m, n, spacing_m)
+
+    def _moved_to(self, T_world_rig: F64) -> tuple[_PlacesOnRoute, float]:
+        xy = T_world_rig[:2, 3]
+        places = _PlacesOnRoute.near(self._route.xyz, T_world_rig)
+        if self._last is None:
+            begin_m, _ = places.first_pass()
+        else:
+            last_m, last_xy = self._last
+            reach_m = REACH_M + 2.0 * float(np.hypot(*(xy - last_xy)))
+            begin_m, away_m = places.within(last_m - reach_m, last_m + reach_m)
+            if away_m > LEFT_M:
+                anywhere_m, distance_m = places.first_pass()
+                begin_m = anywhere_m if distance_m <= FOUND_M else begin_m
+        self._last = begin_m, np.array(xy)
+        return places, begin_m
+
+
+@dataclass(frozen=True)
+class _PlacesOnRoute:
+    """The place of each segment of a route that is nearest to the ego.
+
+    Attributes:
+        line: ``(S + 1, 3)`` the route.
+        along_m: ``(S + 1,)`` arc lengths of its vertices.
+        s_m: ``(S,)`` arc length of each place.
+        distance_m: ``(S,)`` from the ego.
+        cost_m: ``(S,)`` the distance, and what the ego's heading differs from the segment's.
+    """
+
+    line: F64
+    along_m: F64
+    s_m: F64
+    distance_m: F64
+    cost_m: F64
+
+    @classmethod
+    def near(cls, line: F64, T_world_rig: F64) -> _PlacesOnRoute:
+        """Project the ego on each segment of a line ``(S + 1, 3)``."""
+        along_m = arc_lengths(line)
+        step, share, offset = _on_segments(line, T_world_rig[:2, 3])
+        distance_m = np.linalg.norm(offset, axis=1)
+        error_rad = np.abs(wrap_angle(heading_of(step) - yaw_of(T_world_rig)))
+        s_m = along_m[:-1] + share * np.sqrt(np.maximum(np.sum(step * step, axis=1), 1e-300))
+        return cls(line, along_m, s_m, distance_m, distance_m + HEADING_WEIGHT_M * error_rad)
+
+    def first_pass(self) -> tuple[float, float]:
+        """Return arc length and distance of the best place on the first pass that is nearly as good
+        as the best of the whole route.
+        """
+        is_near = self.cost_m <= self.cost_m.min() + SAME_PASS_M
+        first = int(np.argmax(is_near))
+        others = np.flatnonzero(~is_near[first:])
+        end = first + int(others[0]) if len(others) else len(is_near)
+        return self._at(first + int(np.argmin(self.cost_m[first:end])))
+
+    def within(self, low_m: float, high_m: float) -> tuple[float, float]:
+        """Return arc length and distance of the best place between two arc lengths."""
+        inside = (self.along_m[1:] >= low_m) & (self.along_m[:-1] <= high_m)
+        return self._at(int(np.argmin(np.where(inside, self.cost_m, np.inf))))
+
+    def _at(self, segment: int) -> tuple[float, float]:
+        return float(self.s_m[segment]), float(self.distance_m[segment])
+
+
+def _sampled(
+    places: _PlacesOnRoute, T_world_rig: F64, begin_m: float, n: int, spacing_m: float
+) -> F64:
+    """Return points ``(n, 3)`` of a route from an arc length on, in the rig frame; see
+    `route_in_rig`.
     """
     out = np.full((n, 3), np.nan)
-    line = route.xyz
-    if len(line) < 2:
-        return out
-    along = arc_lengths(line)
-    # The arc length of the point of the route that is nearest in place and direction; ``along`` are
-    # those of its points.
-    step, share, offset = _on_segments(line, T_world_rig[:2, 3])
-    distance = np.linalg.norm(offset, axis=1)
-    error = np.abs(wrap_angle(heading_of(step) - yaw_of(T_world_rig)))
-    i = int(np.argmin(distance + HEADING_WEIGHT_M * error))
-    begin = float(along[i] + share[i] * np.sqrt(max(np.sum(step[i] * step[i]), 1e-300)))
-    stations = begin + spacing_m * np.arange(n)
-    on_route = stations <= along[-1] + 1e-9
-    out[on_route] = transform_points(
-        inverse(T_world_rig), resample(line, stations[on_route], along)
-    )
+    stations = begin_m + spacing_m * np.arange(n)
+    on_route = stations <= places.along_m[-1] + 1e-9
+    points = resample(places.line, stations[on_route], places.along_m)
+    out[on_route] = transform_points(inverse(T_world_rig), points)
     out[on_route, 2] = 0.0
     return out
 

@@ -259,7 +259,7 @@ def _sample(
     pose = rotated_about_camera(state.T_world_rig, camera, yaw_rad)
     path = rollout.line.path
     points, headings = expert_path(path, state.s_m, pose, state.speed_mps)
-    route = route_in_rig(Route(path.xyz[::4]), pose)
+    route = route_in_rig(Route(path.xyz[::4]), pose, about_m=state.s_m)
     earlier = last if last is not None and random.random() > 0.1 else (now, state)
     # The earlier frame has nearly the same yaw perturbation.
     yaw_before = float(np.clip(yaw_rad + random.normal(0.0, 0.02), -MAX_YAW_RAD, MAX_YAW_RAD))
