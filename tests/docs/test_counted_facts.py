@@ -1,5 +1,6 @@
 """Facts that pages count or quote are those of the code."""
 
+import importlib
 import re
 
 import pytest
@@ -61,3 +62,12 @@ def test_every_environment_variable_of_ours_is_on_its_page(repo):
     page = (repo / "docs" / "environment.md").read_text()
     assert len(named) > len(OF_PYTEST_ALONE)
     assert {name for name in named - OF_PYTEST_ALONE if name not in page} == set()
+
+
+def test_the_picture_of_the_rooms_is_that_of_the_layers(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
+    script = importlib.import_module("architecture_picture")
+    assert script.PICTURE.read_text() == script.picture(), f"run python {script.__file__}"
+    edges = set(script.direct(script.imports()))
+    assert ("renderers", "streets") in edges
+    assert ("renderers", "world") not in edges  # follows from streets
