@@ -40,6 +40,7 @@ from scenarios.budget import check_record, check_scenario
 from scenarios.build import UNPOSTED, before_end, built_drive
 from scenarios.cameras import camera_spec, check_mounts, given_cameras
 from scenarios.map_lines import alpasim_view
+from scenarios.measured import measured_range
 from scenarios.recorded import RecordedLog
 from scenarios.schema import VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
@@ -194,6 +195,7 @@ def _scenario(draft: SceneDraft, drive: RecordedLog, cameras: tuple[CameraSpec, 
         varied=draft.varied,
         recording=drive.recording,
         model=drive.model,
+        measured=measured_range(drive, cameras),
         standing=drive.standing,
         path_beyond=beyond,
         path_end="road" if drive.path_end == "record" and len(beyond) else drive.path_end,

@@ -510,6 +510,17 @@ STANDING_ID = "obstacle-"
 
 
 @dataclass(frozen=True)
+class MeasuredRange:
+    """How far from the recorded path a reconstruction was compared with photographs that its fit did
+    not see.
+    """
+
+    lateral_m: float  # of the camera farthest from the path of the fitted photographs
+    turn_deg: float  # of its axis, in plan view, from that of the camera to drive by
+    n_photographs: int  # that were compared; 0: nothing was
+
+
+@dataclass(frozen=True)
 class Scene:
     """What evaluators may see of a scenario: the map and the human drive, never pixels."""
 
@@ -523,6 +534,7 @@ class Scene:
     # (N, 3) metres, world: the lane behind the recorded drive, as far as a rollout may go
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
     path_end: PathEndKind = "record"  # what the end of the path is
+    measured: MeasuredRange | None = None  # of a reconstructed drive; None: the scene is built
 
 
 @dataclass(frozen=True)
@@ -568,6 +580,7 @@ class Scenario:
     stop_at_path_end: bool = True  # see `alpasim_plugin.core.path_end`
     # how far ahead of the ego the points of `Observation.route_rig` begin
     route_offset_m: float = 0.0
+    measured: MeasuredRange | None = None  # of a reconstructed drive; None: the scene is built
     # what the loader read beside the scenario file: path -> digest of the content
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -607,6 +620,7 @@ class Scenario:
             self.standing,
             self.path_beyond,
             self.path_end,
+            self.measured,
         )
 
 

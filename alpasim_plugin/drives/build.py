@@ -41,8 +41,9 @@ from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.scene.log_views import actors_at
-from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, write_drive
+from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, read_drive, write_drive
 from scenarios.map_lines import corridor
+from scenarios.measured import measured_range
 from scenarios.recorded import RecordedLog
 
 SCENARIO_FILE = "scenario.yaml"
@@ -239,7 +240,17 @@ def write_folder(
     _write_transforms(work, photographs, exposures)
     write_drive(work, log, standing.obstacles)
     comparisons, coverage = measure(model, views, exposures, tell)
-    quality = write_page(work, drive, placed, standing, len(views["fitted"]), comparisons, coverage)
+    written = read_drive(work)
+    quality = write_page(
+        work,
+        drive,
+        placed,
+        standing,
+        len(views["fitted"]),
+        comparisons,
+        coverage,
+        measured_range(written, written.cameras),
+    )
     length_us = int(log.ego_log.t_us[-1])
     timing = ""
     if length_us < SHORT_US:

@@ -15,7 +15,7 @@ from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.geometry import inverse, left_of, shifted, unit
 from alpasim_plugin.core.image_metrics import psnr_db, ssim
-from alpasim_plugin.core.types import F32, F64
+from alpasim_plugin.core.types import F32, F64, MeasuredRange
 from alpasim_plugin.drives.obstacles import Standing
 from alpasim_plugin.drives.placing import PlacedDrive
 from alpasim_plugin.drives.source import SourceDrive
@@ -123,6 +123,7 @@ def write_page(
     fitted: int,
     comparisons: Mapping[str, Sequence[Comparison]],
     coverage: Mapping[float, float],
+    measured: MeasuredRange | None,
 ) -> dict[str, Any]:
     """Write ``quality.json``, ``quality.md`` and the images.
 
@@ -132,6 +133,7 @@ def write_page(
         standing: Obstacles.
         fitted: How many photographs the model was fitted to.
         comparisons, coverage: From `measure`.
+        measured: How far from the path photographs were compared.
 
     Returns:
         What ``quality.json`` holds.
@@ -158,6 +160,7 @@ def write_page(
             {"lateral_m": lateral_m, "share": round(share, 4)}
             for lateral_m, share in coverage.items()
         ],
+        "measured": None if measured is None else vars(measured),
         "obstacles": {
             "boxes": len(spread),
             "uncertainty_m": round(float(np.median(spread)), 2) if spread else None,
@@ -170,6 +173,22 @@ def write_page(
     write_json(folder / "quality.json", quality)
     write_text(folder / "quality.md", _page(drive, quality, examples))
     return quality
+
+
+def _range_text(measured: Mapping[str, float] | None) -> str:
+    """Say how far from the recorded path renders were compared with photographs."""
+    if measured is None or not measured["n_photographs"]:
+        return "No render was compared with a photograph: a run counts all its steps as `beyond_measured_share`."
+    place = "on the recorded path alone"
+    if measured["lateral_m"]:
+        place = f"up to {measured['lateral_m']:.2f} m beside the recorded path"
+    turn = (
+        f" and turned by up to {measured['turn_deg']:.0f} degrees" if measured["turn_deg"] else ""
+    )
+    return (
+        f"These lie {place}{turn}. Farther away nobody has looked: a run counts its steps there as "
+        "`beyond_measured_share`."
+    )
 
 
 def _mean(rows: Sequence[Comparison], name: str) -> float:
@@ -200,6 +219,7 @@ def _page(
         "\n".join(f"- {escape(note)}" for note in notes),
         f"## Photographs that the fit never saw, of {quality['fitted']} that it saw",
         f"| photographs | number | PSNR, dB | SSIM |\n|---|---|---|---|\n{rows}".rstrip(),
+        _range_text(quality["measured"]),
         "## Coverage of the lower half of the image",
         f"| metres to the left of the path | covered |\n|---|---|\n{covered}",
     ]

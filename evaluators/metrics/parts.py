@@ -51,4 +51,10 @@ PARTS = (
         target="evaluators.metrics.image_health:FACTORY",
         help="black and frozen camera images",
     ),
+    RegisteredPart(
+        kind="evaluator",
+        name="measured",
+        target="evaluators.metrics.measured:FACTORY",
+        help="steps of a reconstructed drive beyond where renders were compared with photographs",
+    ),
 )

@@ -558,6 +558,18 @@ METRICS = MetricTable(
             formula="any camera's image of that time equals, byte for byte, the last other one although the ego has moved more than 0.1 m "
             "since",
         ),
+        "beyond_measured_share": MetricInfo(
+            "",
+            "lower",
+            "mean",
+            "share of the steps that lie farther from the recorded path, or are turned farther from it, than any photograph with which the reconstruction was compared",
+            is_share=True,
+            label="steps beyond what was compared",
+            margin=0.05,
+            reference=CENTRE,
+            invalid="the scene is built; then there is no row",
+            formula="1 where `c` is farther from `P` than the farthest camera whose photographs no fit saw (at least 0.25 m), or the heading differs by more than its axis does (at least 5 degrees)",
+        ),
         "safety_monitor_triggered": _flag(
             "the policy's own safety monitor fired", direction="none", formula="0; `alpasim` only"
         ),

@@ -13,6 +13,7 @@ from alpasim_plugin.log.run_folder.records import LogDifference
 from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_END, SHORT_OF_END
 from evaluators.pages.decision import verdict_text
 from evaluators.pages.fixers import fixer_cautions
+from evaluators.pages.measured import measured_cautions
 from evaluators.pages.policies import drive_call_lines, policy_cautions
 from evaluators.results import Difference, Endings, Mean
 from evaluators.statistics.decision import read_decision
@@ -326,7 +327,8 @@ def overview_of(run: Run) -> Overview:
         parts.append(f"policy {run.policies[0]}")
     elif len(run.renderers) == 1:
         parts.append(f"renderer {run.renderers[0]}")
-    cautions = [*fixer_cautions(summary), *policy_cautions(run), *drive_call_lines(run)]
+    cautions = [*fixer_cautions(summary), *measured_cautions(summary)]
+    cautions += [*policy_cautions(run), *drive_call_lines(run)]
     if summary.copies:
         cautions.append(
             f"{summary.copies} of {plural(len(run.rollouts), 'rollout')} are copies: "

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import inside
 from alpasim_plugin.core.json_types import JsonView
@@ -15,6 +18,7 @@ from alpasim_plugin.log.run_folder.reader import last_output
 from alpasim_plugin.log.run_folder.records import DriveEvent, PolicyCheck
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.log.run_folder.schema import OUTPUT_NAME
+from evaluators.metrics.measured import BEYOND
 from evaluators.metrics.outcomes import (
     ENDED,
     OUTCOMES,
@@ -160,10 +164,32 @@ def cause_of(
     ]
     made_up = "" if failed_us is None else seen_before(frame_rows, failed_us)
     sentences += [f"{made_up}."] if made_up else []
+    if failed_us is not None and BEYOND in run.table and rollout.ok:
+        sentences += beyond_sentences(run.steps_of(rollout), failed_us)
     ended = None if manifest is None else manifest.ended
     if rollout.ok and ended in ENDED:
         sentences.append(f"The rollout ended since {ENDED[ended]}.")
     return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log, failure)
+
+
+def beyond_sentences(steps: pa.Table, failed_us: int) -> list[str]:
+    """Say since when, before a failure, the ego drove where no render was compared with a photograph;
+    nothing where it did not at the failure.
+
+    Args:
+        steps: Of the rollout, as `Run.steps_of` reads them.
+        failed_us: When it failed.
+    """
+    keep = (pc.field("metric") == BEYOND) & pc.field("valid") & (pc.field("t_us") <= failed_us)
+    rows = steps.filter(keep).sort_by("t_us")
+    flags = rows["value"].to_pylist()
+    if not flags or not flags[-1]:
+        return []
+    since = len(flags) - [*flags[::-1], 0.0].index(0.0)
+    since_s = (failed_us - rows["t_us"][since].as_py()) * 1e-6
+    return [
+        f"For the last {since_s:.1f} s before the failure it drove where no render was compared with a photograph."
+    ]
 
 
 def _measured(
