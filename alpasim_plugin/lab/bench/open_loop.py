@@ -33,7 +33,7 @@ from alpasim_plugin.core.types import (
     read_only,
 )
 from alpasim_plugin.runs.guards import calling, checked_plan, checked_sensors, reset_policy
-from alpasim_plugin.world.route import from_offset, route_in_rig
+from alpasim_plugin.world.route import RouteAhead, from_offset
 
 View = Literal["held-out", "never-fitted", "fitted", "drawn"]
 MOST_TURN_DEG = 20.0  # between a camera and the one in whose place it is shown
@@ -211,13 +211,13 @@ def plans_of(
     plans: list[Plan | None] = []
     with closing(policy):
         reset_policy(policy, seed, role.scenario.route)
+        route_ahead = RouteAhead(role.scenario.route)
         frames: dict[str, Frame] = {}
         for number, image in enumerate(series[role.series_by_camera[role.front.name]]):
             frames = _newest_frames(role, series, images, image.t_us, number)
             is_complete = len(frames) == len(role.series_by_camera)
-            plans.append(
-                checked_plan(policy, _observation(role, image, frames)) if is_complete else None
-            )
+            observation = _observation(role, image, frames, route_ahead)
+            plans.append(checked_plan(policy, observation) if is_complete else None)
         with calling(policy, "end", PolicyError):
             policy.end(frames)
     return plans
@@ -243,7 +243,9 @@ def _newest_frames(
     return frames
 
 
-def _observation(role: Role, image: TrueImage, frames: Mapping[str, Frame]) -> Observation:
+def _observation(
+    role: Role, image: TrueImage, frames: Mapping[str, Frame], route_ahead: RouteAhead
+) -> Observation:
     scenario = role.scenario
     ego = ego_at(scenario, image, role.front)
     return Observation(
@@ -252,7 +254,7 @@ def _observation(role: Role, image: TrueImage, frames: Mapping[str, Frame]) -> O
         {name: read_only(_camera(scenario, name)) for name in role.series_by_camera},
         read_only(ego),
         read_only(_history(scenario.ego_log, ego)),
-        from_offset(route_in_rig(scenario.route, ego.T_world_rig), scenario.route_offset_m),
+        from_offset(route_ahead.in_rig(ego.T_world_rig), scenario.route_offset_m),
     )
 
 
