@@ -22,7 +22,7 @@ from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.interfaces import Fixer
 from alpasim_plugin.core.parts import PartSpec, build
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import I64, U8, Frame
+from alpasim_plugin.core.types import F64, I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.jobs import map_jobs
@@ -40,6 +40,7 @@ from alpasim_plugin.lab.video_metrics.road import road_mask
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
+from alpasim_plugin.lab.video_metrics.video_features import available_i3d, video_features
 from alpasim_plugin.log.run_folder.reader import read_json
 from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
@@ -180,8 +181,11 @@ def measure(
     result: VariantResult,
     seed: int,
     networks: Mapping[str, ImageDistance],
+    weights: Path | None = None,
 ) -> dict[str, Any]:
-    """Return the row of one clip under one variant (`alpasim_plugin.lab.video_metrics.summary`)."""
+    """Return the row of one clip under one variant (`alpasim_plugin.lab.video_metrics.summary`);
+    ``weights`` is the folder of I3D.
+    """
     truth = None if variant.label == TRUTH else clip.truth
     quality = clip_quality(result.video, truth, networks, road_mask(clip.sdmap))
     later_blocks = result.ms_per_frame[1:] or result.ms_per_frame  # the first one is shorter
@@ -195,11 +199,16 @@ def measure(
         "identical": quality.identical,
         "events": dict(result.events),
         "ms_per_frame": [round(ms, 4) for ms in later_blocks],
-        "series": {
-            name: [float(f"{value:.{DIGITS}g}") for value in values]
-            for name, values in quality.series.items()
+        "series": {name: _rounded(values) for name, values in quality.series.items()},
+        "features": {
+            name: [_rounded(vector) for vector in vectors]
+            for name, vectors in video_features(result.video, weights).items()
         },
     }
+
+
+def _rounded(values: F64) -> list[float]:
+    return [float(f"{value:.{DIGITS}g}") for value in values]
 
 
 @dataclass(frozen=True)
@@ -255,9 +264,14 @@ def row_key(clip: QualityClip, work: Work) -> str:
         work.variant.spec and work.variant.spec.digest,
         work.seed,
         work.device,
-        digests(work.weights),
+        metric_digests(work.weights),
     ]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def metric_digests(folder: Path | None) -> dict[str, str]:
+    """Return the metrics that there are weights for, each with the digest of what calibrates it."""
+    return digests(folder) | available_i3d(folder)
 
 
 def finish(work: Work) -> dict[str, Any]:
@@ -285,7 +299,7 @@ def finish(work: Work) -> dict[str, Any]:
     for i in frame_numbers:
         _write_png(work.picture_file(i), result.video[i])
     distances = {name: _network(name, work.weights) for name in available(work.weights)}
-    row = measure(clip, work.variant, result, work.seed, distances)
+    row = measure(clip, work.variant, result, work.seed, distances, work.weights)
     write_json(work.row_file, {"key": key, "row": row})
     return row
 
@@ -325,7 +339,7 @@ def measure_quality(
             for label, spec in variants.items()
         },
         "units": {label: unit_of(spec) for label, spec in variants.items()},
-        "networks": digests(first.weights),
+        "networks": metric_digests(first.weights),
         "load": os.getloadavg()[0],
         "hardware": hardware(),
         "versions": versions(),

@@ -41,3 +41,10 @@ FACTS = {
     GRID[16]: Fact("", "lower", "grid of 16", 3),
     MS: Fact("ms", "lower", "ms per frame", 1),
 }
+
+# Distances between sets of clips; less is closer to the truth
+SET_TITLES = {
+    "fvd": "FVD",
+    "fvd_state_dict": "FVD (state dict)",
+    "fvmd_lk": "FVMD by Lucas-Kanade",
+}

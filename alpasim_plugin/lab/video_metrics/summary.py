@@ -5,7 +5,8 @@ Nothing bounds these metrics, so that no sample bounds their mean over other cli
 difference is that of its median, by order statistics, which hold whatever the distribution.
 
 A row is one clip under one variant: ``arm``, ``clip``, ``values`` (metric -> number),
-``ms_per_frame`` (of later blocks; empty where no fixer ran), ``frames``, ``identical``, ``events``.
+``ms_per_frame`` (of later blocks; empty where no fixer ran), ``frames``, ``identical``, ``events``,
+``features`` (vectors of the whole video, for distances between sets of clips).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from alpasim_plugin.core.errors import EvaluatorError
 from alpasim_plugin.lab.video_metrics.facts import FACTS, MS
+from alpasim_plugin.lab.video_metrics.sets import set_distances
 from evaluators.statistics.intervals import median_interval
 
 Row = Mapping[str, Any]
@@ -35,8 +37,9 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         ``baseline``; ``arms``: VARIANT -> METRIC -> ``mean``, ``spread`` (standard deviation over
         clips; None of one), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
         ``diff`` (the mean), ``spread``, ``median``, ``median_ci95`` ([low, high], or None with
-        ``reason``), ``n_better``, ``n_worse``, ``n``; ``identical``, ``events``, ``frames``,
-        ``clips`` by variant.
+        ``reason``), ``n_better``, ``n_worse``, ``n``; ``sets``: VARIANT -> METRIC -> a distance of
+        all its clips from the true ones (`sets.set_distances`); ``identical``, ``events``,
+        ``frames``, ``clips`` by variant.
 
     Raises:
         EvaluatorError: No row of the baseline.
@@ -51,6 +54,7 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         )
     arms: dict[str, Any] = {}
     paired: dict[str, Any] = {}
+    sets: dict[str, Any] = {}
     facts: dict[str, dict[str, Any]] = {"clips": {}, "frames": {}, "identical": {}, "events": {}}
     for name, by_clip in variants.items():
         clip_rows = list(by_clip.values())
@@ -60,6 +64,8 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         }
         if name not in (baseline, TRUTH):
             paired[name] = _paired(by_clip, variants[baseline])
+        if name != TRUTH and TRUTH in variants:
+            sets[name] = set_distances(by_clip, variants[TRUTH])
         events: Counter[str] = Counter()
         for row in clip_rows:
             events.update(row["events"])
@@ -67,7 +73,7 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         facts["frames"][name] = sorted({int(row["frames"]) for row in clip_rows})
         facts["identical"][name] = sum(int(row["identical"]) for row in clip_rows)
         facts["events"][name] = dict(events)
-    return {"baseline": baseline, "arms": arms, "paired": paired, **facts}
+    return {"baseline": baseline, "arms": arms, "paired": paired, "sets": sets, **facts}
 
 
 def metrics_of(rows: Sequence[Row]) -> list[str]:

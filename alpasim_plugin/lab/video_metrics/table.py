@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from alpasim_plugin.lab.video_metrics.facts import FACTS
+from alpasim_plugin.lab.video_metrics.facts import FACTS, SET_TITLES
 
 ARROWS = {"higher": "\u2191", "lower": "\u2193"}
 
 
 def markdown(summary: Mapping[str, Any]) -> str:
-    """Return two tables of a summary (`alpasim_plugin.lab.video_metrics.summary.summarise`): means,
-    and differences from the baseline.
+    """Return the tables of a summary (`alpasim_plugin.lab.video_metrics.summary.summarise`): means,
+    differences from the baseline, and distances between sets of clips.
 
     Cells are the mean and, in brackets, the standard deviation over clips; of differences the mean
     and, in brackets, the 95 % interval of the median, bold where it excludes zero.
@@ -34,7 +34,30 @@ def markdown(summary: Mapping[str, Any]) -> str:
             for name, values in paired.items()
         ]
         tables.append(_table([f"minus {summary['baseline']}", *titles], rows))
+    tables += _set_table(summary["sets"])
     return "\n".join(tables)
+
+
+def _set_table(sets: Mapping[str, Any]) -> list[str]:
+    """Return the table of distances between sets, if there is one: values with the number of
+    vectors and of their dimensions.
+    """
+    metrics = [name for name in SET_TITLES if any(name in values for values in sets.values())]
+    if not metrics:
+        return []
+    rows = [
+        [variant, *(_set_cell(values.get(name)) for name in metrics)]
+        for variant, values in sets.items()
+    ]
+    titles = [f"{SET_TITLES[name]} {ARROWS['lower']}" for name in metrics]
+    return [_table(["from the truth", *titles], rows)]
+
+
+def _set_cell(entry: Mapping[str, Any] | None) -> str:
+    if entry is None:
+        return ""
+    value = "none" if entry["value"] is None else f"{entry['value']:.1f}"
+    return f"{value} ({entry['vectors']} vectors, {entry['dimensions']} dimensions)"
 
 
 def _cell(metric: str, entry: Mapping[str, Any] | None) -> str:
