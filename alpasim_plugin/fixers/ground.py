@@ -74,7 +74,9 @@ def carry(
     top = int(ground.any(axis=1).argmax()) // step * step
     compared = recorded_images[:2]
     columns = slice(0, None, step)
-    by_depth = _warp_all(compared, target.window(columns, columns), threads)
+    # All pixels of the view are the view itself, which knows its road users' boxes already.
+    sampled = target if step == 1 else target.window(columns, columns)
+    by_depth = _warp_all(compared, sampled, threads)
     view = replace(target, depth=depth, ground=ground, actors={})
     view = view.window(slice(top, None, step), columns)
     by_ground = _warp_all(compared, view, threads)
@@ -87,14 +89,17 @@ def carry(
         + np.where(about, NEAR_PREFERENCE, PREFERENCE) * across**2
     )
     height, width = ground[top:].shape
-    agrees = agrees.repeat(step, axis=0)[:height].repeat(step, axis=1)[:, :width]
-    ground[top:] &= agrees | (target.depth[top:] <= 0)
-    chosen = _by_two(target, depth, ground)
     if step > 1:
-        return tuple(_warp_all(recorded_images, chosen, threads))
+        agrees = agrees.repeat(step, axis=0)[:height].repeat(step, axis=1)[:, :width]
+    ground[top:] &= agrees | (target.depth[top:] <= 0)
+    if step > 1:
+        return tuple(_warp_all(recorded_images, _by_two(target, depth, ground), threads))
     for image, on_ground in zip(by_depth, by_ground, strict=True):
         cv2.copyTo(on_ground, ground[top:].view(np.uint8), image[top:])  # in place
-    return (*by_depth, *_warp_all(recorded_images[2:], chosen, threads))
+    if len(recorded_images) == 2:
+        return tuple(by_depth)
+    others = _warp_all(recorded_images[2:], _by_two(target, depth, ground), threads)
+    return (*by_depth, *others)
 
 
 def _by_two(target: WarpTarget, depth: F32, ground: Bool) -> WarpTarget:

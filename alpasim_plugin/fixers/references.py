@@ -279,7 +279,9 @@ class ReferenceSession:
     def _whole_lenses(self, numbers: Sequence[int], images: Mapping[int, Any]) -> list[Any]:
         """Return recorded frames that have those of the other pinholes of their lens."""
         lenses = [[images[j] for j in self.index.lens(i)] for i in numbers]
-        return [replace(first, others=tuple(others)) for first, *others in lenses]
+        return [
+            replace(first, others=tuple(others)) if others else first for first, *others in lenses
+        ]
 
     def _recorded_images(self, chosen: Sequence[int]) -> dict[int, RecordedImage]:
         """Return recorded frames and those of their lenses by number; those that are not kept are

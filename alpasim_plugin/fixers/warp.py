@@ -98,6 +98,20 @@ class RecordedImage:
     users: Bool | None = None
     others: tuple[RecordedImage, ...] = ()
 
+    @cached_property
+    def padded(self) -> U8:
+        """Return ``rgb`` with a margin of `TAPS` pixels, which gives all that is inside its
+        neighbours; made once for all views into which the frame is carried.
+        """
+        return np.asarray(
+            cv2.copyMakeBorder(self.rgb, *(TAPS,) * 4, cv2.BORDER_REPLICATE), dtype=np.uint8
+        )
+
+    @cached_property
+    def pixels_of_users(self) -> Bool:
+        """Return ``users``, also where there are none."""
+        return np.zeros(self.depth.shape, dtype=bool) if self.users is None else self.users
+
 
 def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     """Carry a recorded frame into a view by the view's depth.
@@ -127,8 +141,7 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
     depth = np.ascontiguousarray(target.depth)
     depth_then = np.ascontiguousarray(recorded.depth)
     ground = np.zeros(shape, dtype=bool) if target.ground is None else target.ground
-    users = np.zeros(depth_then.shape, dtype=bool) if recorded.users is None else recorded.users
-    _coordinates(depth, ground, depth_then, users, A, b, x, y, held)
+    _coordinates(depth, ground, depth_then, recorded.pixels_of_users, A, b, x, y, held)
     names, boxes = target.placed
     absent = np.full((4, 4), np.nan)
     T_then_box = np.array([recorded.actors.get(name, absent) for name in names])
@@ -139,10 +152,8 @@ def warp(recorded: RecordedImage, target: WarpTarget) -> U8:
         box = boxes.ray[i], boxes.eye[i], boxes.walls[i], to_then[i], boxes.pixels[i]
         images = x[part], y[part], held[part]
         _coordinates_on_box(depth[part], depth_then, *box, *images)
-    # Places outside are far off, and black; the margin gives all that is inside its neighbours.
-    margin = (TAPS,) * 4
-    then = cv2.copyMakeBorder(recorded.rgb, *margin, cv2.BORDER_REPLICATE)
-    rgb = cv2.remap(then, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    # Places outside are far off, and black.
+    rgb = cv2.remap(recorded.padded, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
     out: U8 = cv2.insertChannel(held, cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3)
     step = max(1, shape[1] // SEARCHED)
     coarse = slice(0, None, step)

@@ -101,7 +101,9 @@ class RasterOutput:
 
     def to_uint8(self) -> U8:
         """Return ``(H, W, 3)`` uint8 sRGB, rounded to nearest."""
-        return (self.rgb * np.float32(255.0) + np.float32(0.5)).astype(np.uint8)
+        levels = self.rgb * np.float32(255.0)
+        levels += np.float32(0.5)
+        return levels.astype(np.uint8)
 
 
 def background_image(background: Background, camera: PinholeCamera | LensCamera) -> F32:
@@ -118,7 +120,8 @@ def background_image(background: Background, camera: PinholeCamera | LensCamera)
             f"an array of shape {value.shape}: a camera of {camera.width} x {camera.height} pixels",
             f"give (r, g, b) or an image of shape ({camera.height}, {camera.width}, 3)",
         )
-    if not np.isfinite(value).all():
+    # A sum is finite only if all are; one of huge values may overflow, and then each is looked at.
+    if not np.isfinite(value.sum()) and not np.isfinite(value).all():
         raise InputError(
             "its values: NaN or infinity",
             "give finite numbers, 0..1 for sRGB",

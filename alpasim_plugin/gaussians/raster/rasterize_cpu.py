@@ -19,7 +19,6 @@ from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, bac
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.project_kernels import project_part
 from alpasim_plugin.gaussians.raster.raster_kernels import composite_tiles
-from alpasim_plugin.gaussians.raster.rasterize_lens import rasterize_lens
 from alpasim_plugin.gaussians.raster.stages import (
     WORTH_THREADS,
     TileLists,
@@ -64,6 +63,9 @@ def rasterize_prepared(
     require_kernels()
     threads = thread_count(threads)
     if isinstance(camera, LensCamera):
+        # Its kernels are looked up only where somebody looks through a lens: a tenth of a second.
+        from alpasim_plugin.gaussians.raster.rasterize_lens import rasterize_lens
+
         return rasterize_lens(
             nodes, camera, background, near_m=near_m, threads=threads, starts=starts
         )
