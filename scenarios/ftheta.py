@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.cameras.lens import rays_of
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import parsing
+from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.fields import Fields, met_in
 from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
 from alpasim_plugin.core.json_types import JsonObject
@@ -107,7 +107,8 @@ def _sensors(archive: Archive) -> JsonObject:
         return {}
     rows = archive.table(member)
     with parsing(f"{archive.path}, {member}", "give one row with rig_json"):
-        rig = json.loads(rows[0]["calibration_estimate"]["rig_json"])
+        text = rows[0]["calibration_estimate"]["rig_json"]
+        rig = parse_json(text, f"{archive.path}, {member}, rig_json")
         return {str(s["name"]).replace(":", "_"): s for s in rig["rig"]["sensors"]}
 
 

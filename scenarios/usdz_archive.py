@@ -5,7 +5,6 @@ by member, within limits.
 from __future__ import annotations
 
 import contextlib
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,13 @@ from alpasim_plugin.core.files.fields import field_name, met_in
 from alpasim_plugin.core.files.limits import (
     ARCHIVE_BYTES,
     JSON_BYTES,
+    SCENE_BYTES,
     SOURCE_BYTES,
     YAML_BYTES,
     Bound,
 )
-from alpasim_plugin.core.files.reading import check_names, open_regular
-from alpasim_plugin.core.files.tables import parse_parquet
+from alpasim_plugin.core.files.tables import parse_rows
+from alpasim_plugin.core.files.zips import open_zip, read_member
 from alpasim_plugin.core.json_types import JsonObject
 from scenarios.recorded import SourceFiles
 
@@ -35,20 +35,18 @@ class Archive:
     executed.
 
     Raises:
-        InputError: It is no ZIP, or a member's name is unsafe or stands twice.
+        InputError: It is no ZIP, or refused; see `alpasim_plugin.core.files.zips`.
     """
 
     def __init__(self, files: SourceFiles, path: Path) -> None:
         self.files = files
         self.path = path
+        self._bytes_read = 0
         with contextlib.ExitStack() as opening:
-            stream = opening.enter_context(open_regular(path, ARCHIVE_BYTES))
-            with parsing(path, "fetch the file again; it may be truncated", "no readable ZIP"):
-                self._zip = opening.enter_context(zipfile.ZipFile(stream))
-                infos = self._zip.infolist()
-            check_names([info.filename for info in infos], path)
+            do_this = "fetch the file again; it may be truncated"
+            self._zip = opening.enter_context(open_zip(path, ARCHIVE_BYTES, do_this))
             self._open = opening.pop_all()
-        self._infos = {info.filename: info for info in infos}
+        self._infos = {info.filename: info for info in self._zip.infolist()}
 
     def __enter__(self) -> Archive:
         return self
@@ -72,26 +70,17 @@ class Archive:
             bound: How many bytes it may have.
 
         Raises:
-            InputError: It is missing, encrypted, damaged, or larger than the limit, whatever size
-                the archive states.
+            InputError: It is missing, damaged, or larger than its bound, or all that was read is
+                larger than the archive's; see `read_member`.
         """
-        location = f"{self.path}, {member}"
         info = self._infos.get(member)
         if info is None:
+            location = f"{self.path}, {member}"
             raise InputError(f"{location}: no such member", "give a complete AlpaSim scene")
-        most = int(bound.high)
-        if info.file_size > most:
-            raise InputError(
-                f"{location}: {info.file_size} bytes", f"give a member below {most} bytes"
-            )
-        do = "fetch the file again; it may be damaged"
-        with (
-            parsing(location, do, "it cannot be read"),
-            self._zip.open(info) as stream,
-        ):
-            data = stream.read(most + 1)
-        if len(data) > most:
-            raise InputError(f"{location}: more than {most} bytes", "do not use this file")
+        do_this = "fetch the file again; it may be damaged"
+        data = read_member(self._zip, info, bound, self.path, do_this)
+        self._bytes_read += len(data)
+        SCENE_BYTES.check(self._bytes_read, self.path)
         self.files.note_bytes(member, data)
         return data
 
@@ -125,11 +114,11 @@ class Archive:
         location = f"{self.path}, {member}"
         name = Path(member).stem
         with parsing(location, "fetch the file again", "no readable parquet"):
-            table = parse_parquet(self.read(member), location)
-            for column in table.schema:
+            schema, rows = parse_rows(self.read(member), location)
+            for column in schema:
                 holder = column.name if column.name in ("key", name) else ""
                 if holder and pa.types.is_struct(column.type):
                     self.files.met += met_in(holder, (part.name for part in column.type))
                 else:
                     self.files.met.append(field_name(name, column.name))
-            return table.to_pylist()
+            return rows

@@ -24,9 +24,10 @@ import yaml
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, write_json, write_text
-from alpasim_plugin.core.files.config import load_yaml
-from alpasim_plugin.core.files.limits import ARCHIVE_BYTES
-from alpasim_plugin.core.files.reading import open_regular
+from alpasim_plugin.core.files.config import load_yaml, parse
+from alpasim_plugin.core.files.limits import ARCHIVE_BYTES, JSON_BYTES, YAML_BYTES
+from alpasim_plugin.core.files.reading import parse_json
+from alpasim_plugin.core.files.zips import open_zip, read_member
 from alpasim_plugin.core.parts import require_installed
 from alpasim_plugin.core.types import (
     Scenario,
@@ -117,18 +118,22 @@ def write_scene(path: Path, ref: ScenarioRef, scenario: Scenario) -> None:
     it, with its own id and vehicle.
     """
     if scenario.source == "usdz":
+        source = _archive_of(ref)
         with (
             atomic_file(path) as partial,
-            open_regular(_archive_of(ref), ARCHIVE_BYTES) as stream,
-            zipfile.ZipFile(stream) as old,
+            open_zip(source, ARCHIVE_BYTES) as old,
             zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as new,
         ):
             for info in old.infolist():
                 if info.filename == "metadata.yaml":
-                    metadata = yaml.safe_load(old.read(info)) | {"scene_id": scenario.scene_id}
+                    data = read_member(old, info, YAML_BYTES, source)
+                    metadata = dict(parse(data.decode(), str(source)).data) | {
+                        "scene_id": scenario.scene_id
+                    }
                     new.writestr(info, yaml.safe_dump(metadata, sort_keys=False))
                 elif info.filename == "rig_trajectories.json":
-                    new.writestr(info, _with_vehicle(old.read(info), scenario))
+                    data = read_member(old, info, JSON_BYTES, source)
+                    new.writestr(info, _with_vehicle(data, scenario))
                 else:
                     with old.open(info) as member, new.open(info, "w") as copy:
                         shutil.copyfileobj(member, copy)
@@ -146,7 +151,7 @@ def _archive_of(ref: ScenarioRef) -> Path:
 
 
 def _with_vehicle(data: bytes, scenario: Scenario) -> bytes:
-    rigs = json.loads(data)
+    rigs = parse_json(data, "rig_trajectories.json")
     (rig,) = rigs["rig_trajectories"]
     wanted = rig_box(scenario.vehicle)
     held = rig.get("rig_bbox")

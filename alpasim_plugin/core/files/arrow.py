@@ -18,6 +18,7 @@ from alpasim_plugin.core.files.limits import (
     SOURCE_BYTES,
     TABLE_COLUMNS,
     TABLE_ROWS,
+    TABLE_TEXT_BYTES,
     UNPACKED_BYTES,
 )
 from alpasim_plugin.core.files.tables import check_text
@@ -69,7 +70,7 @@ def read_arrow(data: Any, location: Path | str) -> Any:
     table = pa.ipc.open_file(pa.BufferReader(data)).read_all()
     TABLE_COLUMNS.check(table.num_columns, location)
     table.validate(full=True)
-    check_text(table, location)
+    check_text(table, location, TABLE_TEXT_BYTES)
     return table
 
 

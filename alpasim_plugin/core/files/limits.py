@@ -86,13 +86,38 @@ JSON_BYTES = Bound(
     "JSON size", "bytes", 0, 64 * MIB, "parsed JSON takes about ten times its size in memory"
 )
 YAML_BYTES = Bound("YAML size", "bytes", 0, MIB, "a scenario takes a few KiB")
+PARSED_VALUES = Bound(
+    "values of a document", "", 0, 5_000_000, "each takes some hundred bytes in memory"
+)
 XML_ELEMENTS = Bound(
     "elements of an XML document", "", 1, 2_000_000, "maps of towns have some 100,000"
+)
+XML_TAG_BYTES = Bound(
+    "size of a tag of an XML document", "bytes", 0, 4 * MIB, "a tag has a few attributes"
+)
+XML_MARKS = Bound(
+    "tags and attributes of an XML document", "", 0, 8_000_000, "maps of towns have a million"
 )
 DEPTH = Bound(
     "depth of nesting", "levels", 0, 64, "no format here nests deeper than a dozen levels"
 )
-MEMBERS = Bound("members of an archive", "", 0, 100_000, "scenes hold a few hundred")
+MEMBERS = Bound("members of an archive", "", 0, 20_000, "scenes hold a few hundred")
+DIRECTORY_BYTES = Bound(
+    "list of an archive's members", "bytes", 0, 8 * MIB, "some hundred bytes name a member"
+)
+SCENE_BYTES = Bound(
+    "what is read of a scene archive", "bytes", 0, 512 * MIB, "map, drive and tracks take megabytes"
+)
+SCENE_TABLE_BYTES = Bound(
+    "unpacked size of a map table", "bytes", 0, 256 * MIB, "the lanes of a town take megabytes"
+)
+TABLE_VALUES = Bound(
+    "values of a map table, counted once a level of nesting",
+    "",
+    0,
+    20_000_000,
+    "the lanes of a town have a million",
+)
 UNPACKED_BYTES = Bound(
     "unpacked size", "bytes", 0, 2 * GIB, "what is packed may not fill the memory"
 )

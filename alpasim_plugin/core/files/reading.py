@@ -27,8 +27,11 @@ from alpasim_plugin.core.files.limits import (
     FILE_BYTES,
     JSON_BYTES,
     MEMBERS,
+    PARSED_VALUES,
     UNPACKED_BYTES,
     XML_ELEMENTS,
+    XML_MARKS,
+    XML_TAG_BYTES,
     Bound,
 )
 from alpasim_plugin.core.json_types import JsonObject, JsonView
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter, ValidationError
 
 CHECK_PATH = "check the path and its permissions"
+XML_PIECE_BYTES = 1 << 20
 FETCH_AGAIN = "fetch or write the file again; it may be damaged"
 
 T = TypeVar("T")
@@ -208,13 +212,28 @@ def parse_json(data: bytes | str, location: Path | str, do_this: str = FETCH_AGA
         do_this: Hint of the errors.
 
     Raises:
-        InputError: Not JSON, nested too deep, a number that is not finite (JSON has no NaN), or
-            half a surrogate pair, which no file can be written with.
+        InputError: Not JSON, more values than the bound, nested too deep, a number that is not
+            finite (JSON has no NaN), or half a surrogate pair, which no file can be written with.
     """
+    check_values(data, location)
     with parsing(location, do_this, "broken JSON"):
         value = json.loads(data)
         json.dumps(value, ensure_ascii=False, allow_nan=False).encode()  # numbers and text as above
     return value
+
+
+def check_values(data: bytes | str, location: Path | str) -> None:
+    """Refuse a JSON document that may have more values than the bound, before it is parsed: as many
+    as it has commas and opening brackets, those in its texts included.
+
+    Raises:
+        InputError: It has more.
+    """
+    if isinstance(data, bytes):
+        marks = sum(data.count(mark) for mark in (b",", b"[", b"{"))
+    else:
+        marks = sum(data.count(mark) for mark in (",", "[", "{"))
+    PARSED_VALUES.check(marks, location)
 
 
 def read_json(path: Path | str, do_this: str = FETCH_AGAIN) -> Any:
@@ -243,7 +262,9 @@ def read_json_lines(path: Path | str, do_this: str = FETCH_AGAIN) -> list[JsonOb
         InputError: As `read_json`, with the number of the line.
     """
     rows = []
-    for n, line in enumerate(read_bytes(path, JSON_BYTES, do_this).splitlines(), 1):
+    data = read_bytes(path, JSON_BYTES, do_this)
+    check_values(data, path)
+    for n, line in enumerate(data.splitlines(), 1):
         if line.strip():
             location = f"{path}:{n}"
             rows.append(
@@ -292,6 +313,7 @@ def read_record(
     """
     from pydantic import ValidationError
 
+    check_values(data, location)
     try:
         return cast("T", _adapter(cast(Hashable, record)).validate_json(data, strict=True))
     except ValidationError as error:
@@ -390,12 +412,19 @@ def parse_xml(data: bytes, location: Path | str) -> ElementTree.Element:
         nonlocal depth
         depth -= 1
 
+    XML_MARKS.check(data.count(b"<") + data.count(b"="), location)
     scout = expat.ParserCreate()
     scout.StartDoctypeDeclHandler = refuse
     scout.StartElementHandler = begin
     scout.EndElementHandler = end
     with parsing(location, FETCH_AGAIN, "malformed XML"):
-        scout.Parse(data, True)
+        # Piece by piece: a parser holds all attributes of an element before it calls back.
+        for offset in range(0, len(data), XML_PIECE_BYTES):
+            piece = data[offset : offset + XML_PIECE_BYTES]
+            scout.Parse(piece, False)
+            unfinished = offset + len(piece) - max(scout.CurrentByteIndex, 0)
+            XML_TAG_BYTES.check(unfinished, location)
+        scout.Parse(b"", True)
         return ElementTree.fromstring(data)
 
 

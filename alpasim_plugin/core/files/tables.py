@@ -9,12 +9,16 @@ from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.limits import (
+    SCENE_TABLE_BYTES,
     TABLE_BYTES,
     TABLE_COLUMNS,
     TABLE_ROWS,
     TABLE_TEXT_BYTES,
+    TABLE_VALUES,
+    Bound,
 )
 from alpasim_plugin.core.files.reading import FETCH_AGAIN, check_regular, parsing
+from alpasim_plugin.core.json_types import JsonObject
 
 NO_PARQUET = "no readable parquet"
 
@@ -37,16 +41,34 @@ def read_parquet(
         InputError: Unreadable or no parquet, more rows or bytes than the bounds, a column missing
             or of another type.
     """
-    table = _read(path, path, do_this)
+    file, schema = _open(path, path, do_this, TABLE_BYTES)
+    table = _read(file, schema, path, do_this, TABLE_TEXT_BYTES)
     check_columns(table, columns, path, do_this)
     return table
 
 
-def parse_parquet(data: bytes, location: Path | str, do_this: str = FETCH_AGAIN) -> Any:
-    """Return a parquet document as an Arrow table; see `read_parquet`."""
+def parse_rows(
+    data: bytes, location: Path | str, do_this: str = FETCH_AGAIN
+) -> tuple[Any, list[JsonObject]]:
+    """Return a parquet document's Arrow schema and its rows as plain data, whose lists and objects
+    take many times what the table takes.
+
+    Raises:
+        InputError: As `read_parquet`, with narrower bounds, or more values than the bound.
+    """
     import pyarrow as pa
 
-    return _read(pa.BufferReader(data), location, do_this)
+    source = pa.BufferReader(data)
+    file, schema = _open(source, location, do_this, SCENE_TABLE_BYTES)
+    facts = file.metadata
+    values = 0
+    for group in range(facts.num_row_groups):
+        for column in range(facts.num_columns):
+            chunk = facts.row_group(group).column(column)
+            values += chunk.num_values * (1 + chunk.path_in_schema.count("."))
+    TABLE_VALUES.check(values, location)
+    table = _read(file, schema, location, do_this, SCENE_TABLE_BYTES)
+    return table.schema, table.to_pylist()
 
 
 def check_parquet(
@@ -55,39 +77,55 @@ def check_parquet(
     """Check the header of a parquet file that is read in parts later, and return its columns; see
     `read_parquet` for what is refused.
     """
-    _, schema = _open(path, path, do_this)
+    _, schema = _open(path, path, do_this, TABLE_BYTES)
     empty = schema.empty_table()
     check_columns(empty, columns, path, do_this)
     return list(empty.column_names)
 
 
-def _read(source: Any, location: Path | str, do_this: str) -> Any:
-    """Return a parquet file as a table of the types that it states."""
-    file, schema = _open(source, location, do_this)
+def _read(
+    file: Any,
+    schema: Any,
+    location: Path | str,
+    do_this: str,
+    text_bound: Bound,
+) -> Any:
+    """Return what `_open` opened as a table of the types that the file states."""
     with parsing(location, do_this, NO_PARQUET):
         table = file.read()
         table.validate(full=True)
-        check_text(table, location)
+        check_text(table, location, text_bound)
         return table.cast(schema)
 
 
-def check_text(table: Any, location: Path | str) -> None:
+def check_text(table: Any, location: Path | str, bound: Bound) -> None:
     """Refuse a table whose texts, which it holds once for all rows that repeat them, take more than
     the bound where each row has its own.
 
     Raises:
         InputError: They do.
     """
+    size = sum(_text_bytes(chunk) for column in table.columns for chunk in column.chunks)
+    bound.check(size, location)
+
+
+def _text_bytes(array: Any) -> int:
+    """Return how many bytes the texts of an Arrow array take where each value has its own; those in
+    its lists and objects count, others than codes of a dictionary do not.
+    """
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    size = 0
-    for column in table.columns:
-        for chunk in column.chunks if pa.types.is_dictionary(column.type) else ():
-            if is_text(chunk.dictionary.type):
-                lengths = pc.binary_length(chunk.dictionary)
-                size += pc.sum(pc.take(lengths, chunk.indices)).as_py() or 0
-    TABLE_TEXT_BYTES.check(size, location)
+    if pa.types.is_dictionary(array.type):
+        if not is_text(array.type.value_type):
+            return 0
+        lengths = pc.binary_length(array.dictionary)
+        return pc.sum(pc.take(lengths, array.indices)).as_py() or 0
+    if pa.types.is_struct(array.type):
+        return sum(_text_bytes(array.field(i)) for i in range(array.type.num_fields))
+    if pa.types.is_list(array.type) or pa.types.is_large_list(array.type):
+        return _text_bytes(array.values)
+    return 0
 
 
 def is_text(type_: Any) -> bool:
@@ -98,7 +136,7 @@ def is_text(type_: Any) -> bool:
     return any(test(type_) for test in tests)
 
 
-def _open(source: Any, location: Path | str, do_this: str) -> tuple[Any, Any]:
+def _open(source: Any, location: Path | str, do_this: str, bound: Bound) -> tuple[Any, Any]:
     """Open a parquet file; refuse more rows, columns or unpacked bytes than the bounds, by its
     header.
 
@@ -115,18 +153,29 @@ def _open(source: Any, location: Path | str, do_this: str) -> tuple[Any, Any]:
         TABLE_ROWS.check(facts.num_rows, location)
         TABLE_COLUMNS.check(facts.num_columns, location)
         schema = file.schema_arrow
-        texts = [field.name for field in schema if is_text(field.type)]
+        texts = _text_columns(facts, schema)
         sizes = [
             _size_in_memory(facts, i, j, texts)
             for i in range(facts.num_row_groups)
             for j in range(facts.num_columns)
         ]
-        TABLE_BYTES.check(sum(sizes), location)
+        bound.check(sum(sizes), location)
         if texts:
             file = pq.ParquetFile(
                 source, metadata=facts, read_dictionary=texts, page_checksum_verification=True
             )
     return file, schema
+
+
+def _text_columns(facts: Any, schema: Any) -> list[str]:
+    """Return the paths of the columns that hold texts, those in lists and objects included."""
+    columns = [facts.schema.column(i) for i in range(facts.num_columns)]
+    at_top = {field.name for field in schema if is_text(field.type)}
+    return [
+        column.path
+        for column in columns
+        if column.path in at_top or ("." in column.path and column.logical_type.type == "STRING")
+    ]
 
 
 def _size_in_memory(facts: Any, group: int, column: int, texts: Collection[str]) -> int:

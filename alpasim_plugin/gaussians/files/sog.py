@@ -6,9 +6,7 @@ out their largest component; scales and colours are entries of codebooks of 256;
 are shared by palette. Axes are those of a PLY.
 """
 
-import io
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from alpasim_plugin.core.files import parse_json, read_bytes
 from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.files.limits import GAUSSIANS, SOURCE_BYTES, STORED_PIXELS
 from alpasim_plugin.core.files.reading import as_shape, parsing
+from alpasim_plugin.core.files.zips import open_zip, read_member
 from alpasim_plugin.core.types import F64, U8
 from alpasim_plugin.gaussians.cloud import GaussianArrays
 from alpasim_plugin.gaussians.constants import EPS2D_PX2
@@ -94,17 +93,14 @@ def read_sog(path: Path) -> GaussianArrays:
     if os.path.isdir(path) or path.name == META:
         folder = path if os.path.isdir(path) else path.parent
         return _read(lambda name: read_bytes(folder / Path(name).name, SOURCE_BYTES), folder / META)
-    data = read_bytes(path, SOURCE_BYTES)
     with (
         parsing(path, DO_THIS, "a damaged zip"),
-        zipfile.ZipFile(io.BytesIO(data)) as archive,
+        open_zip(path, SOURCE_BYTES, DO_THIS) as archive,
     ):
-        names = {
-            Path(info.filename).name: info
-            for info in archive.infolist()
-            if info.file_size <= SOURCE_BYTES.high
-        }
-        return _read(lambda name: archive.read(names[name]), path)
+        infos = {Path(info.filename).name: info for info in archive.infolist()}
+        return _read(
+            lambda name: read_member(archive, infos[name], SOURCE_BYTES, path, DO_THIS), path
+        )
 
 
 def _read(get: Get, location: Path) -> GaussianArrays:

@@ -28,6 +28,7 @@ from alpasim_plugin.core.files import parse_json, parsing
 from alpasim_plugin.core.files.arrays import open_npy
 from alpasim_plugin.core.files.atomic import atomic_file, atomic_folder, restore_folder
 from alpasim_plugin.core.files.limits import GIB, Bound
+from alpasim_plugin.core.files.zips import open_zip, read_member
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.lab.training.pair_store import SEQUENCE_FILE, write_info
@@ -109,21 +110,25 @@ def unpack(path: Path, folder: Path) -> Path:
     Raises:
         InputError: It is no pack, or damaged.
     """
-    with parsing(path, MAKE, "no pack of training pairs"), zipfile.ZipFile(path) as archive:
+    with (
+        parsing(path, MAKE, "no pack of training pairs"),
+        open_zip(path, do_this=MAKE) as archive,
+    ):
         names = archive.namelist()
         for name in names:
             split, sequence, *parts = name.split("/")
             if parts != [SEQUENCE_FILE]:
                 continue
-            if ".." in (split, sequence) or os.path.isabs(name):
-                raise ValueError(f"the name {name}")
             restore_folder(folder / split / sequence)
             if not (folder / split / sequence / SEQUENCE_FILE).exists():
                 start = f"{split}/{sequence}/"
                 files = {name.removeprefix(start): name for name in names if name.startswith(start)}
                 size = sum(archive.getinfo(entry).file_size for entry in files.values())
                 SEQUENCE_BYTES.check(size, f"{path}, {start}")
-                contents = {name: archive.read(entry) for name, entry in files.items()}
+                contents = {
+                    name: read_member(archive, archive.getinfo(entry), SEQUENCE_BYTES, path, MAKE)
+                    for name, entry in files.items()
+                }
                 _decode(contents, folder / split / sequence)
     return folder
 
