@@ -12,7 +12,7 @@ import grpc
 import numpy as np
 import pytest
 
-from alpasim_plugin.alpasim.server import caches, hosting
+from alpasim_plugin.alpasim.server import caches, hosting, senders
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.caches import SceneCache
 from alpasim_plugin.alpasim.server.driver_service import MOST_POSES, DriverService, _unknown_scene
@@ -111,6 +111,14 @@ def is_served(host, name, **options):
     return bool(answer.version_id) and status == health_pb2.HealthCheckResponse.SERVING
 
 
+def wait_until(holds):
+    """Wait until a condition holds, and fail where it does not in a minute."""
+    until_s = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+
+
 class Silence:
     """The request stream of a caller that stays silent and then closes."""
 
@@ -171,7 +179,7 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
     monkeypatch,
 ):
     monkeypatch.setattr(hosting, "RECEIVING", 4)
-    monkeypatch.setattr(hosting, "SENDING_S", 0.5)
+    monkeypatch.setattr(senders, "SENDING_S", 0.5)
     monkeypatch.setattr(hosting, "UPKEEP_S", 0.1)
     name = "EgodriverService"
     silence = Silence()
@@ -185,26 +193,69 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
 
 def test_slow_senders_are_cancelled_soon_where_others_wait_for_their_places(monkeypatch):
     monkeypatch.setattr(hosting, "RECEIVING", 4)
-    monkeypatch.setattr(hosting, "SENDING_S", 3600.0)
-    monkeypatch.setattr(hosting, "CROWDED_S", 0.2)
+    monkeypatch.setattr(senders, "SENDING_S", 3600.0)
+    monkeypatch.setattr(senders, "CROWDED_S", 0.2)
+    entered = []
+    enter = senders.Senders.enter
+
+    def watched(callers, context):
+        enter(callers, context)
+        entered.append(context)
+
+    monkeypatch.setattr(senders.Senders, "enter", watched)
     name = "SensorsimService"
     silence = Silence()
+
+    def take_a_place(channel):
+        call = say_nothing(name, "get_version")(channel, silence)
+        wait_until(lambda: len(entered) > len(calls))
+        calls.append(call)
+
+    calls = []
     own = [("grpc.use_local_subchannel_pool", 1)]  # a connection of its own
     with (
         served(name) as host,
         channel_to(host) as channel,
         grpc.insecure_channel(host.address, own) as other,
     ):
-        alone = say_nothing(name, "get_version")(other, silence)
-        time.sleep(0.5)  # it is the first
-        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(3)]
-        time.sleep(0.5)  # all places are taken
+        for connection in (other, channel, channel, channel):
+            take_a_place(connection)
         assert is_served(host, name)
-        assert failure(lambda: next(calls[0]))[0] is Code.CANCELLED
-        assert alone.is_active()
-        for call in (alone, *calls):
+        alone, first, *later = calls
+        assert failure(lambda: next(first))[0] is Code.CANCELLED
+        assert all(call.is_active() for call in (alone, *later))
+        for call in calls:
             call.cancel()
         silence.over.set()
+
+
+class Call:
+    """The context of a call, which takes its time to end."""
+
+    is_cancelled = False
+
+    def peer(self):
+        return "somebody"
+
+    def cancel(self):
+        self.is_cancelled = True
+
+
+def test_no_more_senders_are_cancelled_than_calls_wait(monkeypatch):
+    monkeypatch.setattr(senders, "CROWDED_S", -1.0)  # at once
+    callers = senders.Senders()
+    calls = [Call() for _ in range(3)]
+    for call in calls:
+        callers.enter(call)
+    with callers.waiting():
+        callers.make_room()
+        callers.make_room()  # the first one has not given its place back
+        assert [call.is_cancelled for call in calls] == [True, False, False]
+        callers.left(calls[0])
+        callers.make_room()
+        assert [call.is_cancelled for call in calls] == [True, True, False]
+    callers.make_room()  # nobody waits
+    assert not calls[2].is_cancelled
 
 
 class LargeImages:

@@ -3,7 +3,7 @@
 import inspect
 import re
 
-from alpasim_plugin.alpasim.server import hosting, lens_cache, views
+from alpasim_plugin.alpasim.server import hosting, lens_cache, senders, views
 from alpasim_plugin.cli.serve import CALLS_AT_A_TIME
 from alpasim_plugin.log.wire.services import MESSAGE_BYTES
 
@@ -23,7 +23,7 @@ def test_the_table_of_a_server_s_limits_is_that_of_the_code(repo):
     assert values["sessions at a time"] == [hosting.SESSIONS]
     assert values["a handshake"] == [hosting.HANDSHAKE_S]
     assert values["messages that are received at a time"] == [hosting.RECEIVING]
-    assert values["the time that a caller has to send one"] == [hosting.SENDING_S]
+    assert values["the time that a caller has to send one"] == [senders.SENDING_S]
     assert values["answers that callers have not taken yet"] == [hosting.UNREAD_BYTES / 2**20]
     assert values["pixels of a frame"] == [
         views.MAX_SIDE_PX,

@@ -11,7 +11,7 @@ import ipaddress
 import logging
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -22,6 +22,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import grpc
 
+from alpasim_plugin.alpasim.server.senders import Senders
 from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.files import read_bytes, read_text
@@ -33,8 +34,6 @@ OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 RECEIVING = 32  # calls whose message is in memory and that are not worked on yet
-SENDING_S = 30.0  # a caller that has not sent its message after so long is cancelled
-CROWDED_S = 0.5  # the same where others wait for their places
 UNREAD_BYTES = 512 << 20  # of all answers that callers have not taken yet
 READING_S = 30.0  # a caller that has not taken its answer after so long is cancelled
 STREAMS = 256  # calls at a time on one connection; further ones wait at the caller
@@ -364,7 +363,7 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         self._wanted = None if token is None else f"Bearer {token}".encode()
         self._working = threading.Semaphore(workers)
         self._receiving = threading.Semaphore(RECEIVING)
-        self._senders: dict[Any, float] = {}  # context of a call -> since when it sends
+        self._senders = Senders()
         self._unread = Unread()
         # A handler of a stream starts before the message has come: a refused call holds no thread.
         self._refusal = grpc.stream_unary_rpc_method_handler(unauthenticated)
@@ -386,24 +385,8 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def cancel_slow(self) -> None:
         """Cancel the calls that have not sent their message, or taken their answer, in time."""
-        latest_s = time.monotonic() - SENDING_S
-        for context, since_s in list(self._senders.items()):
-            if since_s < latest_s:
-                context.cancel()
+        self._senders.cancel_slow()
         self._unread.cancel_slow()
-
-    def _make_room(self) -> None:
-        """Cancel a slow sender earlier, because a call waits for its place: on the connection that
-        has the most places, the call that came first.
-        """
-        senders = list(self._senders.items())
-        places = Counter(context.peer() for context, _ in senders)
-        latest_s = time.monotonic() - CROWDED_S
-        slow = [(context, since_s) for context, since_s in senders if since_s < latest_s]
-        if slow:
-            context, _ = min(slow, key=lambda sender: (-places[sender[0].peer()], sender[1]))
-            self._senders.pop(context, None)
-            context.cancel()
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -415,15 +398,26 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
     def _answer(self, call: Callable[[Any, Any], Any], messages: Any, context: Any) -> Any:
         left = CallTime(context)
         try:
-            with ExitStack() as place:
-                with left.holding(self._receiving, self._make_room):
+            with ExitStack() as working:
+                with self._place(left, context):
                     request = self._received(messages, context)
-                    place.enter_context(left.holding(self._working))
+                    working.enter_context(left.holding(self._working))
                 answer = call(request, context)
                 self._unread.enter(context, answer.ByteSize())
                 return answer
         except Late as late:
             context.abort(grpc.StatusCode.CANCELLED, str(late))
+
+    @contextmanager
+    def _place(self, left: CallTime, context: Any) -> Iterator[None]:
+        """Hold a place for the message of a call."""
+        try:
+            with ExitStack() as place:
+                with self._senders.waiting():
+                    place.enter_context(left.holding(self._receiving, self._senders.make_room))
+                yield
+        finally:
+            self._senders.left(context)
 
     def _received(self, messages: Any, context: Any) -> Any:
         """Wait for the message of a call.
@@ -431,12 +425,12 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
         Raises:
             Late: It did not come.
         """
-        self._senders[context] = time.monotonic()
+        self._senders.enter(context)
         try:
             for message in messages:
                 return message
         finally:
-            self._senders.pop(context, None)
+            self._senders.received(context)
         raise Late("the message did not come")
 
 
