@@ -83,13 +83,13 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     if not hasattr(config, "workerinput"):  # workers inherit the start of the whole session
-        os.environ[BEGAN] = str(time.time())
+        os.environ[BEGAN] = str(time.monotonic())
 
 
 @pytest.hookimpl(tryfirst=True)  # before the marks are looked at
 def pytest_runtest_setup(item):
     limit_s = item.config.getoption("--no-test-after")
-    if limit_s is not None and time.time() - float(os.environ[BEGAN]) > limit_s:
+    if limit_s is not None and time.monotonic() - float(os.environ[BEGAN]) > limit_s:
         item.add_marker(pytest.mark.skip(reason=f"no time after {limit_s:g} s (--no-test-after)"))
 
 

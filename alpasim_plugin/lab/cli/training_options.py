@@ -105,7 +105,7 @@ class Progress:
     """
 
     def __init__(self, steps: int, interval: int | None = None) -> None:
-        self.console, self.steps, self.began = Console(stderr=True), steps, time.time()
+        self.console, self.steps, self.began_s = Console(stderr=True), steps, time.monotonic()
         self.interval = interval or max(steps // 100, 1)
 
     def perceptual_term(
@@ -135,7 +135,9 @@ class Progress:
     def prepared(self, subject: str, done: int, count: int, interval: int = 10) -> None:
         """Report preparation before the first update."""
         if done == count or done % interval == 0:
-            self.console.print(f"{subject}: {done}/{count}, {time.time() - self.began:.0f} s")
+            self.console.print(
+                f"{subject}: {done}/{count}, {time.monotonic() - self.began_s:.0f} s"
+            )
 
     def update(self, step: int, numbers: Mapping[str, float]) -> None:
         """Report an update; ``numbers["s"]`` is its duration in seconds."""
