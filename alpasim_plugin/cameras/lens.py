@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -74,6 +74,7 @@ class Lens:
         T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
         side: Its name among those that cover the lens; empty where it is the only one.
         first_column: The column of the lens at which its part of the image begins.
+        camera: The camera with the lens; None: the lens is that pinhole.
     """
 
     width: int
@@ -86,6 +87,7 @@ class Lens:
     T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
     side: str = ""
     first_column: int = 0
+    camera: CameraSpec | None = None
 
     def spec(self, name: str, T_rig_camera: F64, shutter_us: int = 0) -> CameraSpec:
         """Return the covering pinhole of a lens at a mounting, as a camera."""
@@ -106,6 +108,39 @@ class Lens:
         if place is None:
             return covering
         return cv2.remap(covering, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def depth(self, distance: F32) -> F32:
+        """Return the depth ``(h, w)`` along the pinhole's axis of what the lens's image shows at
+        distances ``(height, width)`` from the camera; 0 where it shows nothing.
+        """
+        if self.resample is None:
+            return distance
+        place, along = self._lens_place
+        along_rays = cv2.remap(
+            distance, place, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+        )
+        return np.asarray(along_rays * along, dtype=np.float32)
+
+    def seen_in(self, image: U8) -> U8:
+        """Return the pinhole's image ``(h, w, 3)`` of the lens's; black where that shows nothing."""
+        if self.resample is None:
+            return image
+        place, along = self._lens_place
+        looked_up = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(looked_up * (along > 0)[..., None], dtype=np.uint8)
+
+    @cached_property
+    def _lens_place(self) -> tuple[F32, F32]:
+        """Where the lens shows each pixel ``(h, w, 2)``, and the share of a distance that lies along
+        the axis there ``(h, w)``, 0 where the lens shows nothing.
+        """
+        assert self.camera is not None, "a pinhole that covers a lens"
+        place, is_visible = place_in_lens(self.camera, self)
+        width, height = self.cover
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(self.K).T
+        along = is_visible / np.linalg.norm(plane, axis=-1)
+        return place, along.astype(np.float32)
 
 
 def lens_camera(pinhole: str) -> str:
@@ -227,8 +262,6 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
     if sides[0].resample is None:
         return first
     events = dict.fromkeys(event for frame in frames for event in frame.events)
-    blank = np.zeros((1, 1, 4), dtype=np.uint8)
-    references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
     alphas = [frame.alpha for frame in frames]
     return replace(
         first,
@@ -236,10 +269,17 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
         rgb=joined_image(sides, [frame.rgb for frame in frames]),
         alpha=None if first.alpha is None else joined_image(sides, alphas, 1),
         depth=None,
-        references=tuple(joined_image(sides, images, holds=True) for images in references),
+        references=joined_references(sides, frames),
         events=tuple(events),
         on_device=None,
     )
+
+
+def joined_references(sides: Sequence[Lens], frames: Sequence[Frame]) -> tuple[U8, ...]:
+    """Return the references of a lens's frame from those of its pinholes."""
+    blank = np.zeros((1, 1, 4), dtype=np.uint8)
+    references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
+    return tuple(joined_image(sides, images, holds=True) for images in references)
 
 
 def joined_image(
@@ -342,6 +382,16 @@ def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
     """Return where a camera's lens shows rays ``(N, 3)``: pixels ``(N, 2)``, the middle of the
     first being (0.5, 0.5), and which of them it shows, up to `BEYOND_PX` beyond its image.
     """
+    pixel, is_described = projected(camera, ray)
+    size = np.array([camera.width, camera.height])
+    inside = ((pixel > -BEYOND_PX) & (pixel < size + BEYOND_PX)).all(axis=1)
+    return pixel, is_described & inside
+
+
+def projected(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
+    """Return where a camera's lens puts rays ``(N, 3)``, inside its image or outside of it: pixels
+    ``(N, 2)``, the middle of the first being (0.5, 0.5), and which of them the lens model describes.
+    """
     lens, K = _checked(camera)
     across = np.linalg.norm(ray[:, :2], axis=1)
     if lens.kind == "opencv":
@@ -360,10 +410,7 @@ def pixels_of(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
             good = angle <= _growing(lens)
         plane = ray[:, :2] / np.maximum(across, 1e-12)[:, None] * radius[:, None]
         pixel = plane * K[[0, 1], [0, 1]] if lens.kind == "fisheye" else plane @ _linear(lens).T
-    pixel = pixel + K[:2, 2]
-    size = np.array([camera.width, camera.height])
-    inside = ((pixel > -BEYOND_PX) & (pixel < size + BEYOND_PX)).all(axis=1)
-    return pixel, good & inside
+    return pixel + K[:2, 2], good
 
 
 class RadialForm(NamedTuple):
@@ -679,7 +726,8 @@ def _covered(
     shape = camera.height, camera.width
     visible = None if covered.all() else covered.reshape(shape)
     place = place.reshape(*shape, 2)
-    return Lens(camera.width, camera.height, K, cover, place, visible, T_lens_pinhole=T, side=side)
+    size = camera.width, camera.height
+    return Lens(*size, K, cover, place, visible, T_lens_pinhole=T, side=side, camera=camera)
 
 
 def _require(fine: bool, name: str, problem: str) -> None:

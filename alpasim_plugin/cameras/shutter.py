@@ -176,19 +176,33 @@ def between(start: F64, end: F64, share: float) -> F64:
 
 
 def motion_px(request: RenderRequest) -> float:
-    """Return by how many pixels a thing in the image moves while the shutter is open, at most.
+    """Return by how many pixels a thing in a pinhole's image moves while the shutter is open, at
+    most; see `largest_motion_px`.
 
-    Of the street that is what is `NEAR_M` away or at infinity, at the image's edge; of the road
-    users in view their near side. Pixels are those of the image's middle: at the edge of a wide
-    pinhole they are smaller, but those of the lens that it stands for are not.
+    Pixels are those of the image's middle: at the edge of a wide pinhole they are smaller, but those
+    of the lens that it stands for are not.
     """
-    assert request.exposure is not None, "a frame without exposure is exposed at one instant"
-    K, (start, end) = request.camera.K, request.T_world_camera
+    K = request.camera.K
     width = request.camera.width
     height = request.camera.height
     u, v = np.meshgrid(np.linspace(0, width, 5), np.linspace(0, height, 5))
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(K).T
-    rays = unit(rays)
+    return largest_motion_px(request, unit(rays), float(max(K[0, 0], K[1, 1])))
+
+
+def largest_motion_px(request: RenderRequest, rays: F64, px_per_rad: float) -> float:
+    """Return by how many pixels a thing in the image moves while the shutter is open, at most.
+
+    Of the street that is what is `NEAR_M` away or at infinity, on some rays of the image; of the road
+    users in view their near side.
+
+    Args:
+        request: With an exposure.
+        rays: ``(N, 3)`` unit, in the camera's axes.
+        px_per_rad: Of the image's middle.
+    """
+    assert request.exposure is not None, "a frame without exposure is exposed at one instant"
+    start, end = request.T_world_camera
     to_start = inverse(start) @ end
     turned = rays @ to_start[:3, :3].T
     moved = to_start[:3, 3] / NEAR_M
@@ -202,7 +216,7 @@ def motion_px(request: RenderRequest) -> float:
         near_m = np.maximum(np.linalg.norm(after, axis=1) - USER_M, NEAR_M)
         in_front = after[:, 2] > -USER_M
         moves.append(np.where(in_front, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
-    return float(max(K[0, 0], K[1, 1]) * max(float(np.max(move)) for move in moves))
+    return float(px_per_rad * max(float(np.max(move)) for move in moves))
 
 
 def angle_between(a: F64, b: F64) -> F64:

@@ -274,11 +274,10 @@ def size_lines(plan: RunPlan) -> list[str]:
     pinholes, pinhole_px = drawn_pixels(largest.cameras)
     cameras = plural(len(largest.cameras), "camera")
     size = f"{cameras} of {pixels / 1e6:.1f} megapixels"
-    by = f"drawn as {pinhole_px / 1e6:.1f} by {plural(pinholes, 'pinhole')}"
-    cost = f"{pinhole_px / PX_PER_S:.1f} CPU seconds"
+    cost = f"{pixels / PX_PER_S:.1f} CPU seconds"
     if largest.background is None and largest.model is None:
         cost += f" and {memory_mb(largest, pinhole_px) / 1e3:.1f} GB"
-    line = f"{largest.scene_id}: {size}, {by}, {cost} behind clean"
+    line = f"{largest.scene_id}: {size}, {cost} behind clean"
     fit_min = fit_cpu_s(largest, pinholes) / 60
     if fit_min and any(spec.base.name == "3dgs" for spec in plan.renderers):
         line += f"; about {fit_min:.1f} CPU minutes to fit its model once"

@@ -103,6 +103,9 @@ class Renderer(Protocol):
         None
     )
     has_history: bool = True  # whether a frame may depend on the requests before its own
+    # whether requests are of cameras with lenses; otherwise of the pinholes that cover them. A frame
+    # through a lens has as depth the distance from the camera's centre.
+    draws_lenses: bool = False
     stage_ms: Mapping[str, float] = (
         # parts of the last call's wall time that are stages of their own, such as {"fix": 12.0}
         EMPTY

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.cameras.lens import blackened
+from alpasim_plugin.cameras.lens import blackened, joined_references
 from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.errors import FixerError, FixerFault, InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
@@ -31,7 +31,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     read_only,
 )
-from alpasim_plugin.fixers.lenses import joined, joined_image
+from alpasim_plugin.fixers.lenses import depth_frames, joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
@@ -65,6 +65,8 @@ class BlockRunner:
         on_device: Whether the fixer takes the references and the map of a frame that a device drew
             from there.
         cover: The pinholes that are rendered of lenses; the fixer sees the lens's image.
+        draws_lenses: Whether the base renderer draws lenses itself; references and maps are made in
+            the pinholes all the same.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -75,6 +77,7 @@ class BlockRunner:
     references: ReferenceSession | None = None
     on_device: bool = False
     cover: LensCover = field(default_factory=LensCover)
+    draws_lenses: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     def reset_times(self) -> None:
@@ -84,9 +87,12 @@ class BlockRunner:
     def render(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
         """Render the frames of an instant, warp their references and draw their maps."""
         cuts = [self.cover.requests(request) for request in requests]
-        parts = self._pinholes([part for cut in cuts for part in cut])
         if not self.cover.sides:
-            return parts
+            return self._conditioned(requests, self.render_base(requests))
+        if self.draws_lenses:
+            return self._through_lenses(requests, cuts)
+        pinholes = [part for cut in cuts for part in cut]
+        parts = self._conditioned(pinholes, self.render_base(pinholes))
         remaining = iter(parts)
         request_parts = [
             (request, [next(remaining) for _ in cut])
@@ -109,8 +115,37 @@ class BlockRunner:
             image = joined_image(sides, [part.map for part in parts])
         return ConditionedFrame(request, frame, image)
 
-    def _pinholes(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
+    def _through_lenses(
+        self, requests: Sequence[RenderRequest], cuts: Sequence[Sequence[RenderRequest]]
+    ) -> list[ConditionedFrame]:
+        """Render frames through lenses, with what is warped and drawn into the pinholes of each."""
         frames = self.render_base(requests)
+        lenses = [self.cover.sides.get(request.camera.name) for request in requests]
+        with self._timed("lens"):
+            depths = [
+                [frame] if sides is None else depth_frames(frame, sides, cut)
+                for frame, sides, cut in zip(frames, lenses, cuts, strict=True)
+            ]
+        pinholes = [part for cut in cuts for part in cut]
+        parts = iter(self._conditioned(pinholes, [part for cut in depths for part in cut]))
+        out = []
+        for request, frame, sides, cut in zip(requests, frames, lenses, cuts, strict=True):
+            lens_parts = [next(parts) for _ in cut]
+            if sides is None:
+                out.append(lens_parts[0])
+                continue
+            with self._timed("lens"):
+                references = joined_references(sides, [part.frame for part in lens_parts])
+                image = None
+                if self.scene_map is not None:
+                    image = joined_image(sides, [part.map for part in lens_parts])
+            out.append(ConditionedFrame(request, frame.changed(references=references), image))
+        return out
+
+    def _conditioned(
+        self, requests: Sequence[RenderRequest], frames: Sequence[Frame]
+    ) -> list[ConditionedFrame]:
+        """Return frames with their references and maps."""
         if self.references is not None:
             with self._timed("references"):
                 frames = self.references.added(requests, frames, self.on_device)
@@ -249,6 +284,7 @@ def fixed_renderer(
     threads: int | None = None,
     recorded: Sequence[RecordedFrame] = (),
     cover: LensCover = LensCover(),
+    draws_lenses: bool = False,
 ) -> Renderer:
     """Return one rollout's renderer whose frames are fixed.
 
@@ -264,7 +300,8 @@ def fixed_renderer(
         scenario: Its map and its actors' boxes are what the semantic map shows.
         threads: Threads of the map rasteriser; None leaves numba's number.
         recorded: Frames of the recorded drive that the base renderer declares.
-        cover: The pinholes that the base renderer draws of the scenario's lenses.
+        cover: The pinholes of the scenario's lenses.
+        draws_lenses: Whether the base renderer draws lenses itself, and not these pinholes.
 
     Raises:
         InputError: No installed package has the mode.
@@ -274,7 +311,7 @@ def fixed_renderer(
     first = complete(make_fixer(), Fixer)
     on_device = first.reads_device
     sources = render, scene_map, scenario.actors
-    runner = BlockRunner(*sources, threads, references, on_device, cover)
+    runner = BlockRunner(*sources, threads, references, on_device, cover, draws_lenses)
     if first.blocks == ONE_BY_ONE:
         return PerFrameRenderer(runner, first)
     modes = installed(MODES)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from alpasim_plugin.cameras.image_map import ImageMap, image_map, with_lens
-from alpasim_plugin.cameras.lens import Rays, rays_of
+from alpasim_plugin.cameras.lens import Rays, rays_at, rays_of
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, Bool, CameraSpec, LensModel
 from alpasim_plugin.gaussians.camera import Posed, Rolling
@@ -16,6 +16,7 @@ from alpasim_plugin.gaussians.cloud import require_rigid
 
 LensKey = tuple[int, int, tuple[float, ...], LensModel]
 KEPT_LENSES = 16
+BOUNDED_BY_PLANES_RAD = np.deg2rad(75.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,26 @@ class LensCamera(Posed):
         """Return which pixels ``(H, W)`` look up, towards +z of the world."""
         return self.rays() @ self.T_camera_world[:3, 2] > 0
 
+    def in_view(self, centre: F64, radius: F64) -> Bool:
+        """Return which spheres ``(N, 3)``, ``(N,)`` in the world may meet what the image shows; of
+        a rolling shutter those as well that come into it by `Rolling.reach_px`.
+        """
+        p = centre @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
+        distance = np.linalg.norm(p, axis=1)
+        angle = np.arctan2(np.linalg.norm(p[:, :2], axis=1), p[:, 2])
+        around = np.arcsin(np.clip(radius / np.maximum(distance, 1e-9), 0.0, 1.0))
+        moved_rad = 0.0
+        if self.rolling is not None:
+            moved_rad = self.rolling.reach_px / max(self.fx, self.fy)
+        visible = angle - around <= lens_map(self.spec).widest_rad + moved_rad
+        low, high = lens_slopes(self.spec)
+        if np.isfinite(low).all() and moved_rad == 0.0:
+            for axis in range(2):
+                for slope, sign in ((low[axis], 1.0), (high[axis], -1.0)):
+                    outside = sign * (slope * p[:, 2] - p[:, axis])
+                    visible &= outside <= radius * np.hypot(1.0, slope)
+        return np.asarray((distance <= radius) | visible, dtype=np.bool_)
+
 
 def lens_key(spec: CameraSpec) -> LensKey:
     """Return what the rays of a camera with a lens depend on."""
@@ -103,6 +124,42 @@ def lens_map(spec: CameraSpec) -> ImageMap:
 def lens_rays(spec: CameraSpec) -> Rays:
     """Return what the pixels of a camera with a lens see, as unit vectors, kept likewise."""
     return _lens_rays(lens_key(spec))
+
+
+def lens_slopes(spec: CameraSpec) -> tuple[F64, F64]:
+    """Return the least and greatest ``x / z`` and ``y / z`` that a camera's lens shows, infinite
+    where it sees so far from its axis that planes bound nothing, kept likewise.
+    """
+    return _lens_slopes(lens_key(spec))
+
+
+def corner_rays(spec: CameraSpec, step: int) -> F64:
+    """Return the rays ``(rows, columns, 3)`` of every ``step``-th corner of a camera's pixels, as
+    far as its image goes, kept likewise.
+    """
+    return _corner_rays(lens_key(spec), step)
+
+
+@lru_cache(maxsize=KEPT_LENSES)
+def _lens_slopes(key: LensKey) -> tuple[F64, F64]:
+    rays = lens_rays(spec_of(key))
+    if rays.widest_rad > BOUNDED_BY_PLANES_RAD:
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    ray = rays.ray[rays.visible]
+    slopes = ray[:, :2] / ray[:, 2:]
+    pixel = 1.0 / lens_map(spec_of(key)).px_per_rad[0] / np.cos(rays.widest_rad) ** 2
+    return slopes.min(axis=0) - pixel, slopes.max(axis=0) + pixel
+
+
+@lru_cache(maxsize=KEPT_LENSES)
+def _corner_rays(key: LensKey, step: int) -> F64:
+    spec = spec_of(key)
+    u, v = np.meshgrid(*(np.arange(-(-size // step) + 1) * step for size in key[:2]))
+    corners = np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)
+    ray = rays_at(spec, corners).ray
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray.flags.writeable = False
+    return ray.reshape(*u.shape, 3)
 
 
 @lru_cache(maxsize=KEPT_LENSES)

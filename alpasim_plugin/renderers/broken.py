@@ -29,6 +29,7 @@ class BrokenRenderer(Renderer):
 
     def __init__(self, clean: CleanRenderer, corrupt: Corruption) -> None:
         self.clean = clean
+        self.draws_lenses = clean.draws_lenses
         self.corrupt = corrupt
 
     def render(self, request: RenderRequest) -> Frame:
@@ -44,6 +45,7 @@ class ShiftedRenderer(Renderer):
 
     def __init__(self, clean: CleanRenderer, right_m: float) -> None:
         self.clean = clean
+        self.draws_lenses = clean.draws_lenses
         self.right_m = right_m
 
     def render(self, request: RenderRequest) -> Frame:
@@ -60,6 +62,7 @@ class StaleRenderer(Renderer):
 
     def __init__(self, clean: CleanRenderer, age_us: int | None) -> None:
         self.clean = clean
+        self.draws_lenses = clean.draws_lenses
         self.age_us = age_us
         self._past: dict[str, deque[tuple[int, U8]]] = {}
 

@@ -6,10 +6,12 @@ import numpy as np
 
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F32, I64, Frame, RenderRequest, Scenario
+from alpasim_plugin.gaussians.lens_camera import lens_rays
+from alpasim_plugin.renderers.view import depths_of, shown_at
 from alpasim_plugin.streets.site import path_of
 from alpasim_plugin.world.ground import height_at
 
-# Along the optical axis: nearer is the ego's own place, farther is thinner than a pixel.
+# Depths: nearer is the ego's own place, farther is thinner than a pixel.
 NEAREST_M = 3.0
 FARTHEST_M = 40.0
 # So many points judge a view, the nearest, which a road user ahead does not hide; this share of them
@@ -31,7 +33,7 @@ class BuiltRoad:
         """Refuse a frame without surfaces where the road is in view.
 
         Args:
-            request: Of a camera that sees straight lines as straight.
+            request: Of any camera.
             frame: What was rendered; its depth is 0 where it shows no surface.
 
         Raises:
@@ -58,14 +60,20 @@ class BuiltRoad:
         if place[2] < height_at(self.ground, place[None])[0] + ABOVE_M:
             return np.zeros((0, 2), dtype=np.int64)
         local = (self.points - place) @ T_world_camera[:3, :3]
-        local = local[(local[:, 2] > NEAREST_M) & (local[:, 2] < FARTHEST_M)]
-        local = local[np.argsort(local[:, 2], kind="stable")]
-        projected = local @ camera.K.T
-        pixels = np.floor(projected[:, :2] / projected[:, 2:]).astype(np.int64)
-        is_inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
-        pixels = pixels[is_inside]
+        depths = depths_of(camera, local)
+        pixels, can_be_seen = shown_at(camera, local)
+        is_near = can_be_seen & (depths > NEAREST_M) & (depths < FARTHEST_M)
+        order = np.argsort(depths[is_near], kind="stable")
+        places = np.floor(pixels[is_near][order]).astype(np.int64)
+        is_inside = ((places >= 0) & (places < [camera.width, camera.height])).all(axis=1)
+        pixels_in_view: I64 = places[is_inside]
+        if camera.lens is not None:
+            sees = lens_rays(camera).visible.reshape(camera.height, camera.width)
+            pixels_in_view = pixels_in_view[sees[pixels_in_view[:, 1], pixels_in_view[:, 0]]]
         if request.exposure is not None:
             share: F32 = np.broadcast_to(request.exposure.share, (camera.height, camera.width))
             # What nobody looks at is not rendered.
-            pixels = pixels[np.isfinite(share[pixels[:, 1], pixels[:, 0]])]
-        return pixels
+            pixels_in_view = pixels_in_view[
+                np.isfinite(share[pixels_in_view[:, 1], pixels_in_view[:, 0]])
+            ]
+        return pixels_in_view

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.types import F32, F64, Scenario
-from alpasim_plugin.renderers.view import View
+from alpasim_plugin.core.types import F32, F64, CameraSpec, Scenario
+from alpasim_plugin.renderers.view import View, depths_of, focal_px, shown_at
 from alpasim_plugin.streets.build_facades import lit_windows, place_houses
 from alpasim_plugin.streets.build_street import lamp_posts
 from alpasim_plugin.streets.site import make_site, path_of, section_of
@@ -151,7 +151,7 @@ def _street_lux(from_lamp: F64) -> F64:
 
 class Rectangle(NamedTuple):
     """Where a spot shows in an image: two corners, ``(x, y)`` in sixteenths of pixels from the middle
-    of the first one, and metres along the optical axis.
+    of the first one, and its depth, metres.
     """
 
     spot: Spot
@@ -160,31 +160,29 @@ class Rectangle(NamedTuple):
     depth_m: float
 
 
-def in_image(
-    spots: Sequence[Spot], K: F64, T_world_camera: F64, shape: tuple[int, int]
-) -> list[Rectangle]:
+def in_image(spots: Sequence[Spot], camera: CameraSpec, T_world_camera: F64) -> list[Rectangle]:
     """Return the upright rectangles that spots are in an image, the farthest first.
 
     Args:
         spots: In any order.
-        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        camera: Its size and lens.
         T_world_camera: ``(4, 4)`` its pose.
-        shape: Height and width, pixels.
     """
     offsets = np.array([spot.middle for spot in spots]).reshape(-1, 3) - T_world_camera[:3, 3]
     local = offsets @ T_world_camera[:3, :3]
     distance = np.linalg.norm(offsets, axis=1)
-    end = 16 * np.array(shape[::-1])
+    depths = depths_of(camera, local)
+    pixels, can_be_seen = shown_at(camera, local)
+    end = 16 * np.array([camera.width, camera.height])
     rectangles = []
     for i in np.argsort(-distance, kind="stable"):
         spot = spots[i]
-        depth_m = float(local[i, 2])
+        depth_m = float(depths[i])
         facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
-        if depth_m < NEAREST_M or distance[i] > SIGHT_M or facing <= 0:
+        if depth_m < NEAREST_M or distance[i] > SIGHT_M or facing <= 0 or not can_be_seen[i]:
             continue
-        centre = (K @ local[i] / depth_m)[:2] - 0.5
-        half = K[0, 0] * spot.half_m / depth_m * np.array([facing, 1.0])
-        low, high = (np.rint(16 * (centre + side * half)).astype(int) for side in (-1, 1))
+        half = focal_px(camera) * spot.half_m / depth_m * np.array([facing, 1.0])
+        low, high = (np.rint(16 * (pixels[i] - 0.5 + side * half)).astype(int) for side in (-1, 1))
         if (high >= -16).all() and (low <= end).all():  # a pixel more, however corners are rounded
             rectangles.append(Rectangle(spot, low.tolist(), high.tolist(), depth_m))
     return rectangles
@@ -199,7 +197,7 @@ def drawn(spots: Sequence[Spot], view: View) -> tuple[F32, F32]:
     height, width = view.depth_m.shape
     light = np.zeros((height, width, 3), dtype=np.float32)
     front = np.full((height, width), np.inf, dtype=np.float32)
-    for spot, low, high, depth_m in in_image(spots, view.K, view.T_world_camera, (height, width)):
+    for spot, low, high, depth_m in in_image(spots, view.camera, view.T_world_camera):
         cv2.rectangle(light, low, high, spot.rgb, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
         cv2.rectangle(front, low, high, depth_m, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
     return light, front

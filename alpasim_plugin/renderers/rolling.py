@@ -1,5 +1,6 @@
-"""Draw the frames of an instant; of a rolling shutter each of its bands from the pose, and with the road users, of
-the band's instant.
+"""Draw the frames of an instant. On the CPU a lens is drawn along each pixel's ray, and a rolling
+shutter at each pixel's time; on a card pinholes are drawn, and a rolling shutter in bands, each from
+the pose, and with the road users, of its instant.
 """
 
 from abc import abstractmethod
@@ -7,16 +8,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from alpasim_plugin.cameras.shutter import Band, at_share, bands, motion_px
+from alpasim_plugin.cameras.shutter import (
+    Band,
+    at_share,
+    bands,
+    largest_motion_px,
+    motion_px,
+)
 from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
 from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
+from alpasim_plugin.gaussians.lens_camera import LensCamera, lens_rays
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.scene_graph import SceneView
+from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneView, pinhole_of
 
 NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still looked for in full
+JUDGED_RAYS = 200  # of a lens, by which the motion in its image is bounded
 Draw = Callable[[Sequence[SceneView]], Sequence[RasterOutput]]
 
 
@@ -25,6 +34,11 @@ class SplatRenderer(Renderer):
 
     has_history = False
     device: str
+
+    @property
+    def draws_lenses(self) -> bool:  # type: ignore[override]  # by the device
+        """Whether lenses are drawn, and not the pinholes that cover them: on the CPU."""
+        return bool(implementation(self.device, True, False))
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
@@ -52,7 +66,7 @@ def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) ->
 
     Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
     time of its pixel. Otherwise the frame is drawn in `bands`, which are joined where they were
-    drawn.
+    drawn; a lens is not.
 
     Args:
         requests: What to draw.
@@ -61,7 +75,7 @@ def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) ->
 
     Returns:
         The images; a pixel that nobody looks at is black and opaque. Depth is along the axis of
-        the pose at the pixel's time.
+        the pose at the pixel's time, through a lens from the camera's centre.
     """
     cuts = [_cut(request, device) for request in requests]
     frames = iter(draw([view for cut in cuts for _, view in cut]))
@@ -88,7 +102,8 @@ def _cut(request: RenderRequest, device: str) -> list[tuple[Band | None, SceneVi
         return [(None, _rolling(request))]
     cut: list[tuple[Band | None, SceneView]] = []
     for band in bands(request):
-        camera = camera_at(request, band.T_world_camera).window(band.rows, band.columns)
+        camera = pinhole_of(camera_at(request, band.T_world_camera))
+        camera = camera.window(band.rows, band.columns)
         cut.append((band, (camera, band.actors)))
     return cut
 
@@ -105,7 +120,7 @@ def _rolling(request: RenderRequest) -> SceneView:
     last = float(share.flat[-1])
     step = (last - first) / max(share.size - 1, 1)
     along = (0.0, step) if share.shape[1] == 1 else (step, 0.0)
-    reach_px = motion_px(request)
+    reach_px = _motion_px(request)
     if reach_px == 0.0:
         return camera, actors
     rolling = Rolling(
@@ -117,7 +132,18 @@ def _rolling(request: RenderRequest) -> SceneView:
     return replace(camera, rolling=rolling), actors
 
 
-def camera_at(request: RenderRequest, T_world_camera: F64) -> PinholeCamera:
+def _motion_px(request: RenderRequest) -> float:
+    """Return by how many pixels things in a request's image move at most while its shutter is open."""
+    if request.camera.lens is None:
+        return motion_px(request)
+    rays = lens_rays(request.camera)
+    sight = rays.ray[rays.visible]
+    return largest_motion_px(request, sight[:: max(1, len(sight) // JUDGED_RAYS)], max(rays.focal))
+
+
+def camera_at(request: RenderRequest, T_world_camera: F64) -> Camera:
     """Return the request's camera at a pose."""
     spec = request.camera
+    if spec.lens is not None:
+        return LensCamera.from_pose(spec, T_world_camera)
     return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.types import F32, F64, Scenario
-from alpasim_plugin.renderers.view import View
+from alpasim_plugin.core.types import F32, F64, CameraSpec, Scenario
+from alpasim_plugin.renderers.view import View, shown_at
 from alpasim_plugin.world.ground import height_at
 from alpasim_plugin.world.path import polyline_path
 
@@ -19,6 +19,7 @@ SIGHT_M = 150.0
 NEAREST_M = 0.3
 SOFT_WIDTHS = 0.002  # of the edges of tracks, in image widths
 SUBPIXEL_BITS = 4  # sixteenths
+BENDS = 6  # straight pieces of which a quad's edge is made that a lens bends
 
 
 class SnowCover:
@@ -44,18 +45,41 @@ class SnowCover:
     def on(self, view: View) -> F32:
         """Return what share of each pixel's surface snow hides ``(H, W)``."""
         local = (self.quads - view.place) @ view.T_world_camera[:3, :3]
-        depth_m = local[..., 2]
-        is_seen = (depth_m.max(axis=1) > NEAREST_M) & (depth_m.min(axis=1) < SIGHT_M)
         cover: F32 = np.full(view.ground.shape, BESIDE, dtype=np.float32)
-        is_whole = depth_m.min(axis=1) > NEAREST_M
-        for quad, share, whole in zip(
-            local[is_seen], self.shares[is_seen].tolist(), is_whole[is_seen].tolist(), strict=True
-        ):
-            projected = (quad if whole else _cut(quad)) @ view.K.T
-            pixels = projected[:, :2] / projected[:, 2:] - 0.5
-            corners = np.rint(16 * np.clip(pixels, -1e5, 1e5)).astype(np.int32)
-            cv2.fillConvexPoly(cover, corners, share, cv2.LINE_8, SUBPIXEL_BITS)
+        draw = _draw_straight if view.camera.lens is None else _draw_bent
+        draw(cover, view.camera, local, self.shares)
         return view.ground * cv2.GaussianBlur(cover, (0, 0), SOFT_WIDTHS * cover.shape[1])
+
+
+def _draw_straight(cover: F32, camera: CameraSpec, quads: F64, shares: F64) -> None:
+    """Draw quads ``(N, 4, 3)`` in a pinhole's axes, whose edges its image shows straight."""
+    depth_m = quads[..., 2]
+    is_seen = (depth_m.max(axis=1) > NEAREST_M) & (depth_m.min(axis=1) < SIGHT_M)
+    is_whole = depth_m.min(axis=1) > NEAREST_M
+    for quad, share, whole in zip(
+        quads[is_seen], shares[is_seen].tolist(), is_whole[is_seen].tolist(), strict=True
+    ):
+        projected = (quad if whole else _cut(quad)) @ camera.K.T
+        pixels = projected[:, :2] / projected[:, 2:] - 0.5
+        corners = np.rint(16 * np.clip(pixels, -1e5, 1e5)).astype(np.int32)
+        cv2.fillConvexPoly(cover, corners, share, cv2.LINE_8, SUBPIXEL_BITS)
+
+
+def _draw_bent(cover: F32, camera: CameraSpec, quads: F64, shares: F64) -> None:
+    """Draw quads ``(N, 4, 3)`` in the axes of a camera whose lens bends their edges; one that the
+    lens does not describe as a whole is left out.
+    """
+    along = np.linspace(0.0, 1.0, BENDS, endpoint=False)[:, None]
+    following = np.roll(quads, -1, axis=1)
+    edges = quads[:, :, None] + along * (following - quads)[:, :, None]
+    outlines = edges.reshape(len(quads), -1, 3)  # (N, 4 BENDS, 3)
+    pixels, can_be_seen = shown_at(camera, outlines.reshape(-1, 3))
+    pixels = pixels.reshape(len(quads), -1, 2) - 0.5
+    is_seen = can_be_seen.reshape(len(quads), -1).all(axis=1)
+    is_seen &= np.linalg.norm(outlines, axis=2).min(axis=1, initial=np.inf) < SIGHT_M
+    for outline, share in zip(pixels[is_seen], shares[is_seen].tolist(), strict=True):
+        corners = np.rint(16 * np.clip(outline, -1e5, 1e5)).astype(np.int32)
+        cv2.fillPoly(cover, [corners], share, cv2.LINE_8, SUBPIXEL_BITS)
 
 
 def _cut(quad: F64) -> F64:

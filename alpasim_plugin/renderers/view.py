@@ -6,7 +6,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from alpasim_plugin.core.types import F32, F64, Box, HeightField
+from alpasim_plugin.cameras.lens import projected
+from alpasim_plugin.core.geometry import intrinsics
+from alpasim_plugin.core.types import F32, F64, Bool, Box, CameraSpec, HeightField
+from alpasim_plugin.gaussians.lens_camera import lens_rays
 from alpasim_plugin.world.ground import height_at
 
 # What is less than this above the ground, and so much more with distance, is ground that the model
@@ -21,17 +24,17 @@ class View:
     """What a camera sees.
 
     Attributes:
-        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        camera: Its size and lens.
         T_world_camera: ``(4, 4)`` its pose.
         rays: ``(H, W, 3)`` unit, world.
-        depth_m: ``(H, W)`` along the optical axis; infinite in the sky.
+        depth_m: ``(H, W)`` as `depths_of` counts it; infinite in the sky.
         distance_m: ``(H, W)`` along the rays; infinite in the sky.
         ground: ``(H, W)`` how much a pixel belongs to the ground, 0 to 1.
         points: ``(H, W, 3)`` world, relative to the camera; on the ground where they belong to it, 0
             in the sky.
     """
 
-    K: F64
+    camera: CameraSpec
     T_world_camera: F64
     rays: F32
     depth_m: F32
@@ -45,9 +48,57 @@ class View:
         return self.T_world_camera[:3, 3]
 
 
+def depths_of(camera: CameraSpec, points: F64) -> F64:
+    """Return the depths ``(N,)`` of points ``(N, 3)`` in a camera's axes as its images have them: of
+    a pinhole along the optical axis, through a lens from its centre.
+    """
+    return points[:, 2] if camera.lens is None else np.linalg.norm(points, axis=1)
+
+
+def shown_at(camera: CameraSpec, points: F64) -> tuple[F64, Bool]:
+    """Return where a camera shows points ``(N, 3)`` in its axes, inside its image or outside of it:
+    pixels ``(N, 2)``, the middle of the first being (0.5, 0.5), and which of them it can show.
+    """
+    if camera.lens is not None:
+        return projected(camera, points)
+    is_ahead = points[:, 2] > 0
+    uvw = points @ camera.K.T
+    return uvw[:, :2] / np.where(is_ahead, uvw[:, 2], 1.0)[:, None], is_ahead
+
+
+def focal_px(camera: CameraSpec) -> float:
+    """Return a camera's pixels per radian on its axis, to the right."""
+    return float(camera.K[0, 0]) if camera.lens is None else lens_rays(camera).focal[0]
+
+
+def intrinsics_on_axis(camera: CameraSpec) -> F64:
+    """Return the intrinsics ``(3, 3)`` of a pinhole that shows what is on a camera's axis as the
+    camera does.
+    """
+    if camera.lens is None:
+        return camera.K
+    return intrinsics(*lens_rays(camera).focal, *camera.K[:2, 2])
+
+
+def _rays_of(camera: CameraSpec, shape: tuple[int, int]) -> tuple[F32, F32]:
+    """Return each pixel's point at the depth 1 ``(H, W, 3)`` in the camera's axes, and its distance
+    ``(H, W)``.
+    """
+    if camera.lens is not None:
+        return lens_rays(camera).ray.reshape(*shape, 3).astype(np.float32), np.ones(
+            shape, dtype=np.float32
+        )
+    K = camera.K
+    height, width = shape
+    local = np.ones((height, width, 3), dtype=np.float32)
+    local[..., 0] = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    local[..., 1] = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
+    return local, np.sqrt(np.einsum("...i,...i->...", local, local))
+
+
 def view_of(
     depth: F32,
-    K: F64,
+    camera: CameraSpec,
     T_world_camera: F64,
     ground: HeightField,
     boxes: Sequence[tuple[F64, Box]] = (),
@@ -55,19 +106,15 @@ def view_of(
     """Return the view of a depth image.
 
     Args:
-        depth: ``(H, W)`` metres along the optical axis; 0 where there is no surface. Above the
+        depth: ``(H, W)`` metres, see `depths_of`; 0 where there is no surface. Above the
             horizon that is the sky; below it is a hole of the model, which is as far away as the
             nearest surface in the image.
-        K: ``(3, 3)`` intrinsics of the pinhole, pixels.
+        camera: Its size and lens.
         T_world_camera: ``(4, 4)`` its pose.
         ground: Heights of the ground.
         boxes: Poses and sizes of road users.
     """
-    height, width = depth.shape
-    local = np.ones((height, width, 3), dtype=np.float32)
-    local[..., 0] = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
-    local[..., 1] = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
-    along = np.sqrt(np.einsum("...i,...i->...", local, local))
+    local, along = _rays_of(camera, (camera.height, camera.width))
     rays = (local / along[..., None]) @ T_world_camera[:3, :3].T.astype(np.float32)
     _, labels = cv2.distanceTransformWithLabels(
         np.uint8(depth == 0), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
@@ -90,4 +137,4 @@ def view_of(
     belongs = np.zeros(depth.shape, dtype=np.float32)
     belongs[is_low] = share
     points[is_low, 2] -= share * above_m
-    return View(K, T_world_camera, rays, depth_m, distance_m, belongs, points)
+    return View(camera, T_world_camera, rays, depth_m, distance_m, belongs, points)

@@ -18,18 +18,35 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import blackened
 from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse
-from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, U8, Frame, RecordedFrame, RenderRequest, Scenario
+from alpasim_plugin.core.types import (
+    F32,
+    F64,
+    U8,
+    CameraSpec,
+    Frame,
+    RecordedFrame,
+    RenderRequest,
+    Scenario,
+)
+from alpasim_plugin.gaussians.lens_camera import lens_rays
 from alpasim_plugin.renderers.built_depth import BuiltDepth
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn, in_image
 from alpasim_plugin.renderers.precipitation import RAIN, SNOW, mirrored_share, wet_albedo
 from alpasim_plugin.renderers.snow import ALBEDO, SnowCover
-from alpasim_plugin.renderers.view import View, view_of
+from alpasim_plugin.renderers.view import (
+    View,
+    depths_of,
+    intrinsics_on_axis,
+    shown_at,
+    view_of,
+)
 
 KOSCHMIEDER = 3.912  # -ln(0.02)
 STEPS = 4095  # of the table from linear light to bytes
@@ -91,10 +108,11 @@ class WeatherRenderer(Renderer):
         device: str = "cpu",
         threads: int | None = None,
     ) -> None:
-        self.base, self.scenario, self.seed = base, scenario, seed
-        self.lookahead = base.lookahead
-        self.block = base.block
-        self.has_history = base.has_history
+        self.base, self.scenario, self.seed = complete(base, Renderer), scenario, seed
+        self.lookahead = self.base.lookahead
+        self.block = self.base.block
+        self.has_history = self.base.has_history
+        self.draws_lenses = self.base.draws_lenses
         self.is_clear = scenario.environment == scenario.environment.in_clear_day
         self.lights = SceneLights(scenario)
         self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], dtype=np.float32)
@@ -145,8 +163,7 @@ class WeatherRenderer(Renderer):
         T_world_camera, actors = request.T_world_camera[-1], request.actors
         if request.exposure is not None:
             T_world_camera, actors = at_share(request, 0.5)
-        shape = camera.height, camera.width
-        if self._is_as_rendered(camera.K, T_world_camera, shape, actors, request.t_us):
+        if self._is_as_rendered(camera, T_world_camera, actors, request.t_us):
             return frame
         rgb = frame.rgb
         depth = frame.depth if self.built is None else self.built.of_request(request)
@@ -154,7 +171,11 @@ class WeatherRenderer(Renderer):
             request.t_us, camera.name, camera.K, T_world_camera, actors, lambda: (rgb, depth)
         )
         T_world_rig = T_world_camera @ inverse(camera.T_rig_camera)
-        return replace(frame, rgb=self._in_weather(rgb, depth, taken, T_world_rig))
+        weathered = self._in_weather(rgb, depth, taken, camera, T_world_rig)
+        if camera.lens is not None:
+            blind = ~lens_rays(camera).visible.reshape(camera.height, camera.width)
+            weathered = blackened(weathered, blind)
+        return replace(frame, rgb=weathered)
 
     def _recorded(self, frame: RecordedFrame) -> tuple[U8, F32]:
         """Return a recorded image in this weather, and its depth as the renderer sees it; the ego is
@@ -170,20 +191,18 @@ class WeatherRenderer(Renderer):
         )
         rgb, seen_depth = frame.read()
         height, width = seen_depth.shape
-        if self._is_as_rendered(
-            frame.K, frame.T_world_camera, (height, width), frame.actors, frame.t_us
-        ):
+        pinhole = CameraSpec(frame.camera, width, height, frame.K, np.eye(4))
+        if self._is_as_rendered(pinhole, frame.T_world_camera, frame.actors, frame.t_us):
             return rgb, seen_depth
         depth = seen_depth
         if self.built is not None:
             depth = self.built.of_recorded(frame, height, width)
-        return self._in_weather(rgb, depth, frame, T_world_rig), seen_depth
+        return self._in_weather(rgb, depth, frame, pinhole, T_world_rig), seen_depth
 
     def _is_as_rendered(
         self,
-        K: F64,
+        camera: CameraSpec,
         T_world_camera: F64,
-        shape: tuple[int, int],
         actors: Mapping[str, F64],
         t_us: int,
     ) -> bool:
@@ -191,10 +210,12 @@ class WeatherRenderer(Renderer):
         in view. Then nobody needs its depth.
         """
         return self.is_clear and not in_image(
-            self.lights.spots(actors, t_us), K, T_world_camera, shape
+            self.lights.spots(actors, t_us), camera, T_world_camera
         )
 
-    def _in_weather(self, rgb: U8, depth: F32, frame: RecordedFrame, T_world_rig: F64) -> U8:
+    def _in_weather(
+        self, rgb: U8, depth: F32, frame: RecordedFrame, camera: CameraSpec, T_world_rig: F64
+    ) -> U8:
         """Return an image in this weather, with the ego at a pose ``(4, 4)``.
 
         Surfaces get their colours, then the light that falls on them, then what lies between them
@@ -202,12 +223,13 @@ class WeatherRenderer(Renderer):
 
         Args:
             rgb: ``(H, W, 3)`` sRGB of the clear day.
-            depth: ``(H, W)`` metres along the optical axis of what the camera looks at, 0 in the
+            depth: ``(H, W)`` metres of what the camera looks at (see `view.depths_of`), 0 in the
                 sky.
             frame: When, from where and beside whom it was taken.
+            camera: Its size and lens.
             T_world_rig: Of the ego.
         """
-        view = self._view(frame, depth)
+        view = self._view(frame, camera, depth)
         spots = self.lights.spots(frame.actors, frame.t_us)
         light = LIGHT_OF_BYTE[rgb]
         self._wet(light, view)
@@ -220,10 +242,10 @@ class WeatherRenderer(Renderer):
         if self.lights.is_night:
             light += glow
         self._veil(light, view)
-        self._draw_falling(light, illumination, frame, depth.shape[:2])
+        self._draw_falling(light, illumination, frame, camera)
         return BYTE_OF_STEP[np.rint(np.clip(light, 0, 1) * STEPS).astype(np.int32)]
 
-    def _view(self, frame: RecordedFrame, depth: F32) -> View:
+    def _view(self, frame: RecordedFrame, camera: CameraSpec, depth: F32) -> View:
         """Return what stands where in an image, road users among it."""
         boxes_by_id = {actor.actor_id: actor.box for actor in self.scenario.actors}
         boxes = [
@@ -231,7 +253,7 @@ class WeatherRenderer(Renderer):
             for actor_id, T_world_box in frame.actors.items()
             if actor_id in boxes_by_id
         ]
-        return view_of(depth, frame.K, frame.T_world_camera, self.scenario.ground, boxes)
+        return view_of(depth, camera, frame.T_world_camera, self.scenario.ground, boxes)
 
     def _wet(self, light: F32, view: View) -> None:
         """Darken the ground where it is wet, in place."""
@@ -295,29 +317,31 @@ class WeatherRenderer(Renderer):
         light += np.float32(visible_share * VEIL_DEG2) / angle_deg[..., None] ** 2
 
     def _draw_falling(
-        self, light: F32, illumination: F32, frame: RecordedFrame, shape: tuple[int, int]
+        self, light: F32, illumination: F32, frame: RecordedFrame, camera: CameraSpec
     ) -> None:
         """Draw drops and flakes, keyed by scene, seed, camera and time, in place."""
+        shape = camera.height, camera.width
         for kind, rate in self.falling:
             key = (self.scenario.scene_id, self.seed, f"{kind.name}.{frame.camera}", frame.t_us)
-            covered = kind.covered(shape, frame.K, rate, stream(*key))
+            covered = kind.covered(shape, intrinsics_on_axis(camera), rate, stream(*key))
             light += covered[..., None] * (DAY_AIR_RGB * illumination - light)
 
 
 def _is_hidden(spot: Spot, view: View) -> bool:
     """Return whether something stands before a spot's middle, as far as it lies in the image."""
-    local = (spot.middle - view.place) @ view.T_world_camera[:3, :3]
-    if local[2] <= 0:
+    local = ((spot.middle - view.place) @ view.T_world_camera[:3, :3])[None]
+    pixels, can_be_seen = shown_at(view.camera, local)
+    if not can_be_seen[0]:
         return False
-    column, row = np.floor((view.K @ local / local[2])[:2]).astype(np.int64).tolist()
+    column, row = np.floor(pixels[0]).astype(np.int64).tolist()
     height, width = view.depth_m.shape
     if not (0 <= row < height and 0 <= column < width):
         return False
-    return bool(local[2] >= _farthest_m(view.depth_m[row, column]))
+    return bool(depths_of(view.camera, local)[0] >= _farthest_m(view.depth_m[row, column]))
 
 
 def _farthest_m(depth_m: F32) -> F32:
-    """Return how far along the optical axis a lamp is still before a surface, or on it."""
+    """Return how deep a lamp is still before a surface, or on it."""
     return depth_m * np.float32(1 + SEEN_PER_M) + np.float32(SEEN_M)
 
 

@@ -8,7 +8,7 @@ from functools import partial
 from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.errors import RendererFault
 from alpasim_plugin.core.files.places import require_kernels
-from alpasim_plugin.core.interfaces import Renderer
+from alpasim_plugin.core.interfaces import Renderer, complete
 from alpasim_plugin.core.parts import RendererSpec, build, resolve_renderer
 from alpasim_plugin.core.types import Scenario
 from alpasim_plugin.runs.guards import calling, checked_frames
@@ -44,13 +44,13 @@ def make_renderer(
     cover = LensCover(scenario.cameras)
     pinhole_scenario = cover.drawn(scenario)
     session = {"seed": seed, "device": device, "threads": threads}
-    built: Renderer = build(spec.base, scenario=pinhole_scenario, **session)
+    built: Renderer = complete(build(spec.base, scenario=pinhole_scenario, **session), Renderer)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
 
     base = in_weather(built, pinhole_scenario, seed, device, threads)
     if spec.fixer is None:
         has_lens = any(camera.lens is not None for camera in scenario.cameras)
-        return LensRenderer(base, cover) if has_lens else base
+        return LensRenderer(base, cover) if has_lens and not base.draws_lenses else base
     from alpasim_plugin.fixers.loop import fixed_renderer
     from alpasim_plugin.fixers.settings import FixerSettings
 
@@ -68,4 +68,5 @@ def make_renderer(
         threads,
         recorded,
         cover,
+        base.draws_lenses,
     )

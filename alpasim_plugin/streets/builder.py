@@ -8,8 +8,8 @@ import numpy as np
 
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Scenario
-from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.scene.scene_graph import (
+    Camera,
     Level,
     NodeSet,
     SceneGraph,
@@ -88,7 +88,7 @@ class LongScene(SceneGraph):
         """Return the nodes of the sections that are held now."""
         return tuple(node for nodes in self._sections.values() for node in nodes)
 
-    def backgrounds(self, cameras: Sequence[PinholeCamera]) -> Sequence[NodeSet]:
+    def backgrounds(self, cameras: Sequence[Camera]) -> Sequence[NodeSet]:
         """Build the sections that cameras may see, free the others, and return those of each."""
         near = [self._near(camera) for camera in cameras]
         needed = sorted(set().union(*near))
@@ -100,7 +100,7 @@ class LongScene(SceneGraph):
                 self._sets = {}
             return [self._set_of(sections) for sections in near]
 
-    def _near(self, camera: PinholeCamera) -> tuple[int, ...]:
+    def _near(self, camera: Camera) -> tuple[int, ...]:
         """Return the sections within sight of a camera; at least the nearest."""
         away_m = np.linalg.norm(self._path[:, :2] - camera.centre_world[:2], axis=1)
         points = np.flatnonzero(away_m <= max(SIGHT_M, float(away_m.min())))

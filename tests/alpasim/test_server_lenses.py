@@ -248,5 +248,4 @@ def test_a_server_shows_through_a_foreign_lens_what_a_run_shows(tmp_path, monkey
         assert seen.std() > 20
         # intrinsics and poses are of single precision on the wire: a pixel may round the other way
         assert_allclose(seen.astype(int), run.render(asked).rgb, atol=2)
-    assert len(drawn) == 3  # all pinholes of a lens at once
-    assert max(drawn) > 1
+    assert drawn == [1, 1, 1]  # each lens in one pass

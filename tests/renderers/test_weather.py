@@ -10,6 +10,7 @@ from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import (
     Actor,
     Box,
+    CameraSpec,
     Exposure,
     Frame,
     Lane,
@@ -57,8 +58,10 @@ def depth_of_road():
     return np.repeat(depth[:, None], 100, axis=1)
 
 
-def view(depth):
-    return view_of(depth, K, AHEAD, flat())
+def view(depth, intrinsics=K):
+    height, width = depth.shape
+    camera = CameraSpec("front", width, height, intrinsics, np.eye(4))
+    return view_of(depth, camera, AHEAD, flat())
 
 
 def scene(*overrides, actors=(), signals=None):
@@ -217,7 +220,7 @@ def test_snow_lies_by_the_map_and_not_on_road_users():
         lit[row, columns], ALBEDO * np.array([LANE, TRACK, TRACK, BESIDE]), atol=0.02
     )
     wide = np.array([[30.0, 0, 50], [0, 30, 30], [0, 0, 1]])
-    near = SnowCover(scenario).on(view_of(depth_of_road() * 0.3, wide, AHEAD, flat()))
+    near = SnowCover(scenario).on(view(depth_of_road() * 0.3, wide))
     columns = (50 + 30 * np.array([0.0, 0.8, -0.8, 2.3]) / 1.58).astype(int)
     np.testing.assert_allclose(near[58, columns], [LANE, TRACK, TRACK, BESIDE], atol=0.02)
     wall = depth_of_wall(12.9)  # the rear of the car, whose lower part is as low as the ground
@@ -362,7 +365,9 @@ def test_weather_of_a_rolling_shutter_is_seen_from_its_middle(monkeypatch):
     monkeypatch.setattr(
         WeatherRenderer,
         "_in_weather",
-        lambda self, rgb, depth, frame, rig: places.append(frame.T_world_camera[:3, 3]) or rgb,
+        lambda self, rgb, depth, frame, camera, rig: (
+            places.append(frame.T_world_camera[:3, 3]) or rgb
+        ),
     )
     WeatherRenderer(WrongDepth(scenario), scenario, 0).render(asked)
     np.testing.assert_allclose(places[0], poses.mean(axis=0)[:3, 3], atol=1e-9)
@@ -459,7 +464,8 @@ def test_a_clear_day_without_a_light_in_view_stays_as_it_is_and_nothing_is_drawn
         image, seen_depth = renderer.recorded()[0].read()
         assert image is rgb
         assert seen_depth is depth
-        assert np.array_equal(renderer._in_weather(rgb, depth, one, np.eye(4)), rgb)
+        camera = CameraSpec("front", 100, 60, K, np.eye(4))
+        assert np.array_equal(renderer._in_weather(rgb, depth, one, camera, np.eye(4)), rgb)
         spec = replace(scenario.cameras[0], name="front", width=100, height=60, K=K)
         request = RenderRequest(0, spec, np.stack([AHEAD, AHEAD]), {})
         frame = Frame(0, "front", rgb, np.ones((60, 100), dtype=np.float32), depth)
@@ -484,7 +490,7 @@ def test_spots_at_the_border_of_an_image_are_those_of_a_larger_image():
     seen = view(np.zeros((60, 100), dtype=np.float32))
     beyond = K.copy()
     beyond[:2, 2] += 64
-    larger = view_of(np.zeros((188, 228), dtype=np.float32), beyond, AHEAD, flat())
+    larger = view(np.zeros((188, 228), dtype=np.float32), beyond)
     inner = slice(64, -64), slice(64, -64)
     for image, whole in zip(drawn(spots, seen), drawn(spots, larger), strict=True):
         np.testing.assert_array_equal(image, whole[inner])

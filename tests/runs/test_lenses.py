@@ -78,3 +78,61 @@ def test_a_fixer_sees_the_image_of_the_lens(straight_road):
     assert seen.frame.rgb.shape == seen.map.shape == (150, 200, 3)
     alone = LensRenderer(inner, cover).render(RenderRequest(0, camera, T, {}))
     np.testing.assert_array_equal(seen.frame.rgb, alone.rgb)
+
+
+class LensDirections(Renderer):
+    """Paints every pixel of a lens with the direction that it sees; all is 5 m away."""
+
+    draws_lenses = True
+
+    def render(self, request):
+        """Draw one frame."""
+        spec = request.camera
+        rays = rays_of(spec)
+        unit = rays.ray / np.linalg.norm(rays.ray, axis=1, keepdims=True)
+        rgb = (127.5 + 127 * unit @ request.T_world_camera[1, :3, :3].T).round().astype(np.uint8)
+        shape = spec.height, spec.width
+        depth = np.full(shape, 5.0, dtype=np.float32)
+        return Frame(request.t_us, spec.name, rgb.reshape(*shape, 3), None, depth)
+
+
+class Kept:
+    """References that say from which depth they would be warped."""
+
+    def added(self, requests, frames, on_device):
+        out = []
+        for request, frame in zip(requests, frames, strict=True):
+            assert request.camera.lens is None
+            assert frame.size == (request.camera.height, request.camera.width)
+            rgba = np.full((*frame.size, 4), 255, dtype=np.uint8)
+            rgba[..., 0] = np.round(10 * frame.depth)
+            out.append(frame.changed(references=(rgba,)))
+        return out
+
+
+def test_a_fixer_over_a_renderer_of_lenses_has_maps_and_references_of_the_same_lens(straight_road):
+    camera = fisheye(straight_road)
+    scenario = replace(straight_road, cameras=(camera,))
+    cover = LensCover([camera])
+    T = np.stack([np.eye(4) @ camera.T_rig_camera] * 2)
+    request = RenderRequest(0, camera, T, {})
+    scene_map = prepare_map(scenario.lane_map)
+    by_pinholes = BlockRunner(Directions(scenario).render_batch, scene_map, (), cover=cover)
+    through_lens = BlockRunner(
+        LensDirections().render_batch,
+        scene_map,
+        (),
+        references=Kept(),
+        cover=cover,
+        draws_lenses=True,
+    )
+    (joined,) = by_pinholes.render([request])
+    (seen,) = through_lens.render([request])
+    np.testing.assert_array_equal(seen.map, joined.map)
+    visible = rays_of(camera).visible.reshape(150, 200)
+    off = np.abs(seen.frame.rgb.astype(int) - joined.frame.rgb)[visible]
+    assert np.mean(off <= 2) > 0.995
+    (reference,) = seen.frame.references
+    ahead = reference[75, 100, 0]
+    assert abs(int(ahead) - 50) <= 1
+    assert (reference[..., 0][visible] > 30).mean() > 0.99

@@ -73,7 +73,7 @@ def test_a_run_says_before_the_first_frame_what_large_cameras_cost(tmp_path):
     )
     assert small == []
     assert "8.2 megapixels" in large[0]
-    assert "drawn as 11.5 by 10" in large[0]
+    assert "1.6 CPU seconds" in large[0]
     assert "CPU minutes to fit" in large[0]
 
 

@@ -120,11 +120,29 @@ class SceneEntry:
         """Render the frames of an instant with their references, which depend on the requests
         alone; what a device drew may stay there.
         """
+        frames = self.bare_frames(requests, on_device)
+        return self.with_references(requests, frames, on_device)
+
+    @property
+    def draws_lenses(self) -> bool:
+        """Whether the renderer draws lenses itself, and not the pinholes that cover them."""
         assert self.renderer is not None, "scenes without a renderer are for maps only"
-        frames = checked_frames(self.renderer, requests, on_device)
-        if self.references is not None:
-            frames = self.references.added(requests, frames, on_device)
-        return frames
+        return self.renderer.draws_lenses
+
+    def bare_frames(
+        self, requests: Sequence[RenderRequest], on_device: bool = False
+    ) -> list[Frame]:
+        """Render the frames of an instant without their references."""
+        assert self.renderer is not None, "scenes without a renderer are for maps only"
+        return checked_frames(self.renderer, requests, on_device)
+
+    def with_references(
+        self, requests: Sequence[RenderRequest], frames: list[Frame], on_device: bool = False
+    ) -> list[Frame]:
+        """Return frames with their references."""
+        if self.references is None:
+            return frames
+        return self.references.added(requests, frames, on_device)
 
 
 class SceneCache:

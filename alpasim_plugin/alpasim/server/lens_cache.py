@@ -63,7 +63,9 @@ def size_of(value: Any) -> int:
     if isinstance(value, tuple):
         return sum(size_of(part) for part in value)
     if hasattr(value, "__dataclass_fields__"):
-        return sum(size_of(getattr(value, name)) for name in value.__dataclass_fields__)
+        return sum(
+            size_of(part) for part in vars(value).values()
+        )  # what was computed since as well
     return 0
 
 

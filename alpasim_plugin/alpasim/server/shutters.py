@@ -40,10 +40,23 @@ def exposure_of(
         return None
     variant = ("shares", view.width, view.height, side.side, *rolls)
     share = lenses.get(spec, variant, lambda: _shares(spec, view, side, *rolls))
-    return Exposure(
-        share,
-        {name: view.objects[name][0] if name in view.objects else T for name, T in actors.items()},
-    )
+    return Exposure(share, _boxes_at_start(view, actors))
+
+
+def lens_exposure(
+    spec: sensorsim_pb2.CameraSpec, view: View, actors: Mapping[str, F64]
+) -> Exposure | None:
+    """Return when the rows or columns of a lens's image are exposed; see `exposure_of`."""
+    rolls = ROLLS.get(spec.shutter_type)
+    if rolls is None or view.start_us == view.t_us:
+        return None
+    return Exposure(rolling(view.width, view.height, *rolls), _boxes_at_start(view, actors))
+
+
+def _boxes_at_start(view: View, actors: Mapping[str, F64]) -> dict[str, F64]:
+    return {
+        name: view.objects[name][0] if name in view.objects else T for name, T in actors.items()
+    }
 
 
 def _shares(

@@ -12,8 +12,9 @@ saw), and a mask lowers it further where it is dark:
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,16 +29,16 @@ from alpasim_plugin.alpasim.server.caches import (
     scene_camera,
 )
 from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
-from alpasim_plugin.alpasim.server.shutters import exposure_of
+from alpasim_plugin.alpasim.server.shutters import exposure_of, lens_exposure
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
-from alpasim_plugin.alpasim.server.views import View, read_sides, straight_of
-from alpasim_plugin.cameras.lens import Lens, blind_of
+from alpasim_plugin.alpasim.server.views import View, camera_of, read_sides, straight_of
+from alpasim_plugin.cameras.lens import Lens, blind_of, joined_references
 from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, project
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
-from alpasim_plugin.fixers.lenses import joined, joined_image
+from alpasim_plugin.fixers.lenses import depth_frames, joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.log.images import decode_image
@@ -146,8 +147,7 @@ def requests_of(
         InputError: A track that the scene does not have.
     """
     actors = boxes_at(entry, view)
-    stored_camera = scene_camera(entry.scenario, view.camera)
-    name = stored_camera.name if stored_camera else view.camera
+    name = name_in_scene(entry, view)
     requests = []
     for side in sides:
         camera = side.spec(name, T_rig_camera, view.t_us - view.start_us)
@@ -155,6 +155,31 @@ def requests_of(
         exposure = exposure_of(request.camera_intrinsics, view, side, actors)
         requests.append(RenderRequest(view.t_us, camera, T, actors, exposure=exposure))
     return requests
+
+
+def lens_request(
+    entry: SceneEntry, request: Request, view: View, T_rig_camera: F64
+) -> RenderRequest:
+    """Return what is to be drawn of a request through its lens.
+
+    Raises:
+        InputError: A track that the scene does not have.
+    """
+    actors = boxes_at(entry, view)
+    camera = replace(
+        camera_of(request.camera_intrinsics, view.width, view.height),
+        name=name_in_scene(entry, view),
+        T_rig_camera=T_rig_camera,
+        shutter_us=view.t_us - view.start_us,
+    )
+    exposure = lens_exposure(request.camera_intrinsics, view, actors)
+    return RenderRequest(view.t_us, camera, view.T_world_camera, actors, exposure=exposure)
+
+
+def name_in_scene(entry: SceneEntry, view: View) -> str:
+    """Return the scene's name of a view's camera; the caller's where it is none of the scene's."""
+    stored_camera = scene_camera(entry.scenario, view.camera)
+    return stored_camera.name if stored_camera else view.camera
 
 
 def drawn_map(
@@ -217,6 +242,39 @@ def with_fitting_map(
     return replace(rendered, frame=frame, sdmap=None)
 
 
+# The frame of a lens without its camera's name on the wire, and what the pinhole that looks straight
+# ahead shows.
+Drawn = tuple[Frame, Callable[[], U8]]
+
+
+def _straight_ahead(pinholes: Sequence[Lens]) -> int:
+    """Return the number of the pinhole that looks straight ahead."""
+    return max(range(len(pinholes)), key=lambda i: float(pinholes[i].T_lens_pinhole[2, 2]))
+
+
+def _drawn_pinholes(
+    entry: SceneEntry, requests: Sequence[RenderRequest], pinholes: Sequence[Lens]
+) -> Drawn:
+    """Draw the pinholes that cover a lens, and join them."""
+    frames = entry.render(requests, entry.reads_device)
+    ahead = frames[_straight_ahead(pinholes)]
+    return joined(requests[0].camera.name, pinholes, frames), lambda: ahead.rgb
+
+
+def _drawn_lens(
+    request: RenderRequest,
+    entry: SceneEntry,
+    requests: Sequence[RenderRequest],
+    pinholes: Sequence[Lens],
+) -> Drawn:
+    """Draw a lens; recorded frames are carried into the pinholes that cover it, and joined."""
+    (frame,) = entry.bare_frames([request])
+    parts = entry.with_references(requests, depth_frames(frame, pinholes, requests))
+    frame = frame.changed(references=joined_references(pinholes, parts))
+    ahead = pinholes[_straight_ahead(pinholes)]
+    return frame, lambda: ahead.seen_in(frame.rgb)
+
+
 class LocalSource:
     """Render scenes here, through the lens and with the shutter of the request.
 
@@ -247,22 +305,26 @@ class LocalSource:
         ]
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
-        """Render the pinholes that cover the request's lens, join them, and check the semantic map
-        against the one that looks straight ahead.
+        """Render the request's lens, or the pinholes that cover it, joined; and check the semantic
+        map against the pinhole that looks straight ahead.
         """
         pinholes = read_sides(request.camera_intrinsics, view.width, view.height)
         entry = self._scenes.get(view.scene_id, left)
-        requests = requests_of(entry, request, view, mount_of(entry, view), pinholes)
+        mount = mount_of(entry, view)
+        requests = requests_of(entry, request, view, mount, pinholes)
+        draw = _drawn_pinholes
+        if entry.draws_lenses and pinholes[0].resample is not None:
+            through_lens = lens_request(entry, request, view, mount)
+            draw = partial(_drawn_lens, through_lens)
         with left.holding(self._busy):
-            frames = entry.render(requests, entry.reads_device)
-            device = frames[0].device if entry.reads_device else "cpu"
+            frame, ahead = draw(entry, requests, pinholes)
+            device = frame.device if entry.reads_device else "cpu"
             sdmap = drawn_map(entry, requests, pinholes, device)
-        frame = joined(view.camera, pinholes, frames).changed(camera=view.camera)
-        rendered = Rendered(frame, sdmap, blind_of(pinholes))
+        rendered = Rendered(frame.changed(camera=view.camera), sdmap, blind_of(pinholes))
         if sdmap is None:
             return rendered
-        ahead = max(range(len(pinholes)), key=lambda i: float(pinholes[i].T_lens_pinhole[2, 2]))
-        return with_fitting_map(rendered, entry, requests[ahead], frames[ahead].rgb, view)
+        index = _straight_ahead(pinholes)
+        return with_fitting_map(rendered, entry, requests[index], ahead(), view)
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.

@@ -16,6 +16,7 @@ import numpy as np
 from alpasim_plugin.core.geometry import interpolate, intrinsics
 from alpasim_plugin.core.types import F32, F64, Actor, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 
 
 def log_actors(scenario: Scenario, t_us: int) -> dict[str, F64]:
@@ -69,7 +70,7 @@ class SkyMask:
         self._sizes = np.array(sizes, dtype=np.float64).reshape(-1, 2)
         self._names = np.array([view.name for view in views])
 
-    def share(self, camera: PinholeCamera, name: str = "") -> F32:
+    def share(self, camera: PinholeCamera | LensCamera, name: str = "") -> F32:
         """Return how much of every pixel ``(H, W)`` is sky, 0 to 1.
 
         Args:
@@ -86,7 +87,7 @@ class SkyMask:
                 break
         return share
 
-    def _in_order(self, camera: PinholeCamera, name: str) -> list[int]:
+    def _in_order(self, camera: PinholeCamera | LensCamera, name: str) -> list[int]:
         """Return the numbers of the views that show any of an image, the first to be asked first:
         those that show directions which the ones before them do not, then the others.
 
@@ -110,13 +111,18 @@ class SkyMask:
                 is_open &= ~shows[i]
         return [*completing, *(i for i in order if i not in completing)]
 
-    def _shown_directions(self, camera: PinholeCamera) -> Bool:
+    def _shown_directions(self, camera: PinholeCamera | LensCamera) -> Bool:
         """Return which of an image's directions lie in each view, ``(V, N)``."""
-        x, y = np.meshgrid(
-            np.linspace(0, camera.width, DIRECTIONS), np.linspace(0, camera.height, DIRECTIONS)
-        )
-        pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])  # (3, N)
-        rays = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K) @ pixels
+        if isinstance(camera, LensCamera):
+            directions = camera.rays()[camera.visible]
+            stride = max(1, len(directions) // DIRECTIONS**2)
+            rays = camera.T_camera_world[:3, :3].T @ directions[::stride].T
+        else:
+            x, y = np.meshgrid(
+                np.linspace(0, camera.width, DIRECTIONS), np.linspace(0, camera.height, DIRECTIONS)
+            )
+            pixels = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])  # (3, N)
+            rays = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K) @ pixels
         projected = self._K @ (self._R @ rays)  # (V, 3, N)
         depth = projected[:, 2]
         places = projected[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
@@ -125,10 +131,12 @@ class SkyMask:
         return np.asarray(inside.all(axis=1) & (depth > 0), dtype=np.bool_)
 
 
-def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
+def _carried(view: SkyView, camera: PinholeCamera | LensCamera) -> tuple[F32, Bool]:
     """Return where a view's sky lies in another camera's image ``(H, W)``, and which of its pixels
     the view saw.
     """
+    if isinstance(camera, LensCamera):
+        return _carried_into_lens(view, camera)
     # The warp counts from pixel centres, cameras from the corner.
     half = intrinsics(1.0, 1.0, 0.5, 0.5)
     to_view = (
@@ -162,3 +170,20 @@ def _carried(view: SkyView, camera: PinholeCamera) -> tuple[F32, Bool]:
     if corners.min() <= 0:
         is_seen &= to_view[2, 0] * columns + to_view[2, 1] * rows + to_view[2, 2] > 0
     return interpolated, is_seen
+
+
+def _carried_into_lens(view: SkyView, camera: LensCamera) -> tuple[F32, Bool]:
+    """Return what `_carried` does of a camera with a lens."""
+    to_view = view.camera.T_camera_world[:3, :3] @ camera.T_camera_world[:3, :3].T
+    projected = (camera.rays() @ (view.camera.K @ to_view).T).astype(np.float32)
+    depth = projected[..., 2]
+    is_ahead = depth > 0
+    ahead = np.where(is_ahead, depth, np.float32(1))
+    x, y = (projected[..., axis] / ahead - np.float32(0.5) for axis in range(2))
+    size = view.camera.width, view.camera.height
+    is_seen = is_ahead & camera.visible
+    for place, count in zip((x, y), size, strict=True):
+        is_seen &= (place > -0.5) & (place < count - 0.5)
+    x, y = (np.where(is_seen, place, np.float32(0)) for place in (x, y))
+    sky = cv2.remap(view.sky, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sky, is_seen

@@ -29,11 +29,12 @@ import numpy as np
 
 from alpasim_plugin.core.detail import halvings_of
 from alpasim_plugin.core.devices import batched, implementation
-from alpasim_plugin.core.errors import RendererError
+from alpasim_plugin.core.errors import InputError, RendererError
 from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.constants import MIP_PX2
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.raster.prepared import Node, PreparedCloud, prepare
 from alpasim_plugin.gaussians.raster.rasterize_cpu import rasterize_prepared
@@ -150,7 +151,8 @@ def nodes_by_tile(
 
 CELL_PX = 3.5  # larger is faster and coarser
 FILE_TILE_M = 16.0  # blocks in which a model from a file is culled
-SceneView = tuple[PinholeCamera, Mapping[str, F64]]  # from where, and ``T_world_box`` of the actors
+Camera = PinholeCamera | LensCamera
+SceneView = tuple[Camera, Mapping[str, F64]]  # from where, and ``T_world_box`` of the actors
 
 
 class ChosenNode(NamedTuple):
@@ -213,7 +215,7 @@ class SceneGraph:
         """Return the background nodes that are held now."""
         return self._whole.nodes
 
-    def backgrounds(self, cameras: Sequence[PinholeCamera]) -> Sequence[NodeSet]:
+    def backgrounds(self, cameras: Sequence[Camera]) -> Sequence[NodeSet]:
         """Return for each camera the background that it may see."""
         return [self._whole] * len(cameras)
 
@@ -224,7 +226,7 @@ class SceneGraph:
     @final
     def render(
         self,
-        camera: PinholeCamera,
+        camera: Camera,
         actor_poses: Mapping[str, F64],
         threads: int | None = None,
         device: str = "cpu",
@@ -268,7 +270,7 @@ class SceneGraph:
         return list(draw(chosen))
 
     def _draw_on_host(
-        self, threads: int | None, view: tuple[PinholeCamera, Sequence[ChosenNode]]
+        self, threads: int | None, view: tuple[Camera, Sequence[ChosenNode]]
     ) -> RasterOutput:
         camera, chosen = view
         nodes: list[Node] = []
@@ -287,14 +289,14 @@ class SceneGraph:
         self,
         device: str,
         held: tuple[SceneNode, ...],
-        views: Sequence[tuple[PinholeCamera, Sequence[ChosenNode]]],
+        views: Sequence[tuple[Camera, Sequence[ChosenNode]]],
     ) -> list[DeviceOutput]:
         from alpasim_plugin.gaussians.raster.rasterize_triton import CloudView, DrawnCloud
 
         _, clouds, place = self._upload(device, held)
         placed = [
             (
-                camera,
+                pinhole_of(camera),
                 [
                     DrawnCloud(place[node.name, level], T, antialiased)
                     for node, level, T, antialiased in chosen
@@ -310,7 +312,7 @@ class SceneGraph:
 
     def _choose(
         self,
-        camera: PinholeCamera,
+        camera: Camera,
         actor_poses: Mapping[str, F64],
         halvings: int,
         background: NodeSet,
@@ -327,8 +329,6 @@ class SceneGraph:
         Raises:
             RendererError: A pose of a road user that has no model.
         """
-        if camera.rolling is not None:
-            camera = camera.widened(camera.rolling.reach_px)
         unknown = sorted(set(actor_poses) - set(self.actors))
         if unknown:
             raise RendererError(
@@ -398,10 +398,28 @@ def _level(node: SceneNode, allowed_m: float, halvings: int) -> int | None:
     return level_numbers[0] if level_numbers else None
 
 
-def in_view(camera: PinholeCamera, centre: F64, radius: F64) -> Bool:
-    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume
-    (conservative at its corners).
+def pinhole_of(camera: Camera) -> PinholeCamera:
+    """Return a camera that a card is to draw.
+
+    Raises:
+        InputError: It has a lens, which the CPU alone draws.
     """
+    if isinstance(camera, LensCamera):
+        raise InputError(
+            "a camera with a lens: a card draws pinholes alone",
+            "use --device cpu, or draw the pinholes that cover the lens",
+        )
+    return camera
+
+
+def in_view(camera: Camera, centre: F64, radius: F64) -> Bool:
+    """Return which spheres ``(N, 3)``, ``(N,)`` in the world meet the camera's view volume
+    (conservative at its corners), while its shutter is open.
+    """
+    if isinstance(camera, LensCamera):
+        return camera.in_view(centre, radius)
+    if camera.rolling is not None:
+        camera = camera.widened(camera.rolling.reach_px)
     p = centre @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     x, y, z = p.T
     visible = z > -radius

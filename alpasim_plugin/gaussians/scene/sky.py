@@ -14,6 +14,7 @@ from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.geometry import heading_of, se2, wrap_angle
 from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.lens_camera import LensCamera, corner_rays
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,6 +30,10 @@ PX_PER_RAD = SPAN_PX / np.array([2 * np.pi, LOW_RAD - HIGH_RAD])
 BLOCK = 16  # rows that are painted at once
 PARTS = 32  # of a pixel, between which colours are interpolated
 STEP_PX = 8  # directions are computed this often and interpolated in between
+# Of a lens: what is so large between two of them, or of whose azimuths the difference is so large, as
+# about the zenith, is computed at every pixel.
+STEP_RAD = 0.06
+AZIMUTH_STEP_RAD = 0.2
 
 # zenith, middle, horizon, what shows below the horizon where the scene has a hole, cloud, hills
 _COLOURS: dict[str, tuple[tuple[float, float, float], ...]] = {
@@ -78,11 +83,13 @@ class Sky:
         """Return the directions' colours as given."""
         return self._panorama[:, :-1]
 
-    def image(self, camera: PinholeCamera) -> F32:
+    def image(self, camera: PinholeCamera | LensCamera) -> F32:
         """Return the sky behind every pixel, ``(H, W, 3)`` float32, 0..1."""
-        h = camera.height
-        w = camera.width
-        columns, rows = (_upsample(grid, h, w) for grid in self._places(camera))
+        if isinstance(camera, LensCamera):
+            columns, rows = _places_through_lens(camera)
+        else:
+            corners = self._places(camera)
+            columns, rows = (_upsample(grid, camera.height, camera.width) for grid in corners)
         # All lie within a turn of column 0: what % would give, in a tenth of its time.
         columns += np.float32(WIDTH) * (columns < 0)
         return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
@@ -134,18 +141,53 @@ class Sky:
         ray = np.stack(
             [*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(v), len(u)))], axis=-1
         )
-        if camera.rolling is not None:
-            a, b, c = camera.rolling.time
-            time = np.clip(a * u[None, :] + b * v[:, None] + c, -0.5, 0.5)[..., None]
-            ray = ray - time * np.cross(camera.motion(np.eye(4), np.eye(4))[:3], ray)
-        ray = ray @ camera.T_camera_world[:3, :3]
-        elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
-        # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
-        forward = camera.T_camera_world[2, :3]
-        ahead = heading_of(forward)
-        azimuth = ahead + wrap_angle(heading_of(ray) - ahead)
-        rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
-        return azimuth * (WIDTH / (2 * np.pi)), rows
+        return _places_of_rays(camera, ray, u[None, :], v[:, None])
+
+
+def _places_of_rays(
+    camera: PinholeCamera | LensCamera, ray: F64, u: FloatArray | I64, v: FloatArray | I64
+) -> tuple[F64, F64]:
+    """Return columns and rows of the panorama that rays ``(..., 3)`` of a camera at pixels u, v see;
+    columns may be negative.
+    """
+    if camera.rolling is not None:
+        a, b, c = camera.rolling.time
+        time = np.clip(a * u + b * v + c, -0.5, 0.5)[..., None]
+        ray = ray - time * np.cross(camera.motion(np.eye(4), np.eye(4))[:3], ray)
+    ray = ray @ camera.T_camera_world[:3, :3]
+    elevation = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
+    # Azimuth relative to the optical axis has no seam inside a view narrower than a half turn.
+    forward = camera.T_camera_world[2, :3]
+    ahead = heading_of(forward)
+    azimuth = ahead + wrap_angle(heading_of(ray) - ahead)
+    rows = (HIGH_RAD - elevation) * ((HEIGHT - 1) / (HIGH_RAD - LOW_RAD))
+    return azimuth * (WIDTH / (2 * np.pi)), rows
+
+
+def _places_through_lens(camera: LensCamera) -> tuple[F32, F32]:
+    """Return columns and rows of the panorama at every pixel of a lens ``(H, W)``: interpolated
+    where directions change evenly, and computed where they do not.
+    """
+    height = camera.height
+    width = camera.width
+    ray = corner_rays(camera.spec, STEP_PX)
+    u, v = np.meshgrid(_steps(width), _steps(height))
+    corners = _places_of_rays(camera, ray, u, v)
+    columns, rows = (np.ascontiguousarray(_upsample(grid, height, width)) for grid in corners)
+    is_uneven = _spread(corners[0]) > AZIMUTH_STEP_RAD * PX_PER_RAD[0]
+    for axis in range(3):
+        is_uneven |= _spread(ray[..., axis]) > STEP_RAD
+    cells = np.repeat(np.repeat(is_uneven, STEP_PX, axis=0), STEP_PX, axis=1)[:height, :width]
+    y, x = np.nonzero(cells)
+    exact = _places_of_rays(camera, camera.rays()[y, x], x + 0.5, y + 0.5)
+    columns[y, x], rows[y, x] = exact
+    return columns, rows
+
+
+def _spread(grid: F64) -> F64:
+    """Return by how much the four corners of each cell of a grid differ."""
+    cells = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[1:, 1:]])
+    return np.ptp(cells, axis=0)
 
 
 def _seen_from(camera: PinholeCamera) -> F64:
