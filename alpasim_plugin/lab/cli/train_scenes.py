@@ -43,8 +43,8 @@ def scenes(
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Draw scenarios; test-unseen has families of roads and traffic, looks and damage that no other
-    split has.
+    """Draw scenarios; every scene of test-unseen has a part of a road or of the traffic, an
+    appearance and damage that the splits train, val and test-known do not have.
     """
     del debug
     console = Console(stderr=True)

@@ -1,9 +1,9 @@
-"""Families of roads and traffic that only the test of unseen families draws from; training never
-sees what they are made of.
+"""Families of roads and traffic that only the test of unseen families draws from.
 
-Held out: tapers (a lane that ends or opens), rows of cars that squeeze the lane, hairpins (radius
-below 35 m), junctions with several lanes an arm, cars parked across the kerb, and objects of class
-``other``.
+Each scene has one of the parts that `held_out` holds out of the fixers' training: tapers (a lane
+that ends or opens), rows of cars that squeeze the lane, hairpins (radius below 35 m), junctions with
+three lanes an arm, cars parked across the kerb, and objects of class ``other``. Its other parts may
+be in training too, junctions with up to two lanes an arm among them.
 """
 
 from __future__ import annotations

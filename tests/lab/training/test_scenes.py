@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from alpasim_plugin.core.geometry import speeds
+from alpasim_plugin.lab.training.held_out import HELD_OUT, held_out_parts
 from alpasim_plugin.lab.training.scene_families import KNOWN_FAMILIES
 from alpasim_plugin.lab.training.scene_families_unseen import UNSEEN_FAMILIES
 from alpasim_plugin.lab.training.scene_looks import KNOWN_DAMAGE, UNSEEN_DAMAGE
@@ -30,19 +31,43 @@ def test_seeds_of_splits_do_not_meet():
     assert all(a[1] <= b[0] for a, b in itertools.pairwise(ranges))
 
 
-def test_unseen_test_shares_no_family_and_no_part_of_a_road_with_training():
+def drawn_for(split):
+    """Return the first drawn specification of every scene of a split."""
+    recipe = SPLITS[split]
+    families = list(recipe.families)
+    specs = []
+    for i in range(recipe.count):
+        family = families[i % len(families)]
+        scene_id = f"{split}-{family}-{i:03d}"
+        seed = recipe.first_seed + i * DRAWS
+        specs.append(draw_spec(split, family, scene_id, seed, recipe.duration_s))
+    return specs
+
+
+def test_the_fixers_train_on_no_part_that_is_held_out():
     assert not set(KNOWN_FAMILIES) & set(UNSEEN_FAMILIES)
-    parts = {
-        split: {s["kind"] for spec in drawn(split) for s in spec["road"]["segments"]}
-        for split in ("train", "test-unseen")
-    }
-    assert {"merge", "narrow_gap"} <= parts["test-unseen"] - parts["train"]
-    labels = {
-        split: {a.get("label", "car") for spec in drawn(split) for a in spec["actors"]}
-        for split in ("train", "test-unseen")
-    }
-    assert labels["test-unseen"] - labels["train"] == {"other"}
-    assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels["train"]
+    for split in ("train", "val", "test-known", "beside-known"):
+        held_out = {spec["scene_id"]: held_out_parts(spec) for spec in drawn_for(split)}
+        assert {name: parts for name, parts in held_out.items() if parts} == {}
+    labels = {actor.get("label", "car") for spec in drawn("train") for actor in spec["actors"]}
+    assert {"car", "truck", "bus", "motorcycle", "cyclist", "pedestrian"} <= labels
+
+
+@pytest.mark.parametrize("split", ["test-unseen", "beside-unseen"])
+def test_every_unseen_scene_has_a_part_that_is_held_out_and_together_they_have_all(split):
+    parts = [held_out_parts(spec) for spec in drawn_for(split)]
+    assert all(parts)
+    assert {name for names in parts for name in names} == set(HELD_OUT)
+
+
+@pytest.mark.parametrize("lanes", ["lanes_forward", "lanes_backward", "cross_lanes"])
+def test_a_junction_is_held_out_from_three_lanes_an_arm_on(lanes):
+    """Two lanes an arm are in training: `composed` and `junction_straight` draw them."""
+    for count, is_held_out in ((2, False), (3, True)):
+        road = {"segments": [{"kind": "intersection"}]}
+        (road if lanes != "cross_lanes" else road["segments"][0])[lanes] = count
+        parts = held_out_parts({"road": road, "actors": []})
+        assert parts == ["junction with three lanes an arm"] * is_held_out
 
 
 @pytest.mark.parametrize("family", first_of(["cross_left", "cross_right"]))
