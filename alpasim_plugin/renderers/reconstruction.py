@@ -12,7 +12,6 @@ that the recording's camera had near by: frames look as the drive's own.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -159,13 +158,14 @@ def ensure(
     not there.
     """
     key = reconstruction_key(scenario, recipe)
-    # Needs torch, which a cached reconstruction does not
-    from alpasim_plugin.renderers.reconstruction_build import (
-        build,
-    )
+
+    def make(folder: Path) -> None:
+        # Needs torch, which takes a second to load and which a cached reconstruction does not need
+        from alpasim_plugin.renderers.reconstruction_build import build
+
+        build(scenario, recipe, threads, device, folder)
 
     name = f"reconstruction of {scenario.scene_id} ({scenario.degradation.kind})"
-    make = partial(build, scenario, recipe, threads, device)
     return cached(KIND, key, make, read_model, name)
 
 

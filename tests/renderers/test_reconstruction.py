@@ -2,6 +2,7 @@
 pixels.
 """
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -177,6 +178,15 @@ def test_damaged_file_is_noticed_and_the_same_model_made_again_by_more_threads(
     ensure(scenario, recipe_of(scenario), threads=2)
     assert "is damaged" in capfd.readouterr().err
     assert (folder / "background.ply").read_bytes() == data
+
+
+def test_a_model_that_is_kept_is_drawn_without_what_fits_it(fitted, monkeypatch):
+    """Torch takes a second to load."""
+    clear_cache("reconstruction:")
+    for name in ("torch", reconstruction_build.__name__):
+        monkeypatch.setitem(sys.modules, name, None)  # importing it raises
+    frame = make_renderer("3dgs", fitted.scenario).render(request(fitted.scenario, 4))
+    assert_array_equal(frame.rgb, fitted.render(request(fitted.scenario, 4)).rgb)
 
 
 def test_a_model_is_fitted_where_its_renderer_draws_and_kept_apart(cache, monkeypatch):
