@@ -1,19 +1,26 @@
 """What a frame and the main job cost here and at another commit, in pairs: ``python -m tests.speed
-BASE``.
+BASE``; and what the first run of the README's main job waits for: ``python -m tests.speed
+--first-run``.
 
 Processes of both commits take turns on one thread, by processor time, so that a busy machine slows
 both; a ratio is the median of those of the pairs. Numbers are printed and nothing is judged by them.
 The commit is checked out beside this one for the time of the measurement. Where it needs libraries
 of its own, ``--base-python`` names an interpreter that has them.
+
+The first run is that of a clone of what is committed, with an empty home, in passed time. The same
+command is given again with its kernels kept, and then with its fits kept as well: what each of them
+takes is the difference.
 """
 
 import argparse
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -89,6 +96,14 @@ print(json.dumps({"main job": 1e3 * (used.ru_utime + used.ru_stime)}))
 """
 
 
+# The first line of the README's main job.
+INSTALL = """
+python3 -m venv .venv
+.venv/bin/pip install -q torch==2.13.0
+.venv/bin/pip install -q -e .
+"""
+
+
 @contextmanager
 def checked_out(commit: str) -> Iterator[Path]:
     """Check a commit out into a temporary folder for the time of the block."""
@@ -120,6 +135,86 @@ def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> 
     return costs
 
 
+def first_run(suite: str, install: bool) -> Mapping[str, float]:
+    """Measure what a user waits for in a clone with an empty home, seconds passed.
+
+    Args:
+        suite: What is driven.
+        install: Whether the README's installation is measured too; else this interpreter's
+            libraries are used.
+
+    Raises:
+        subprocess.CalledProcessError: The clone cannot be installed.
+    """
+    spent: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        clone = Path(folder) / "clone"
+        home = Path(folder) / "home"
+        home.mkdir()
+        subprocess.run(["git", "clone", "-q", str(REPO), str(clone)], check=True)
+        environment = os.environ | {"HOME": str(home), "PYTHONPATH": str(clone)}
+        environment["SIMRUN_CACHE"] = str(home / "cache")
+        environment["NUMBA_CACHE_DIR"] = str(home / "kernels")
+        python = sys.executable
+        if install:
+            began = time.perf_counter()
+            subprocess.run(["bash", "-c", INSTALL], check=True, cwd=clone, env=environment)
+            spent["install"] = time.perf_counter() - began
+            python = str(clone / ".venv/bin/python")
+        command = [python, "-m", "alpasim_plugin.cli.main", "--renderer", ",".join(RENDERERS)]
+        command += ["--policy", "lane-camera", suite]
+        for name in ("first run", "first run, kernels kept", "warm run"):
+            if name == "first run, kernels kept":
+                shutil.rmtree(home / "cache")
+            began = time.perf_counter()
+            done = subprocess.run(command, cwd=clone, env=environment, capture_output=True)
+            spent[name] = time.perf_counter() - began
+            if done.returncode not in (0, 1, 3):
+                sys.exit(done.stderr.decode())
+        began = time.perf_counter()
+        subprocess.run(
+            [python, "-m", "alpasim_plugin.cli.main", "report"],
+            cwd=clone,
+            check=True,
+            env=environment,
+            capture_output=True,
+        )
+        spent["report again"] = time.perf_counter() - began
+    return spent
+
+
+def table_of_waits(spent: Mapping[str, float]) -> str:
+    """Return the seconds of `first_run`, with the differences that they are measured for, as
+    Markdown.
+
+    Example:
+        >>> waits = {"first run": 60.0, "first run, kernels kept": 35.0, "warm run": 20.0}
+        >>> print(table_of_waits(waits))
+        | | passed, s |
+        |---|---:|
+        | first run | 60.0 |
+        | of it compiling kernels | 25.0 |
+        | of it fitting | 15.0 |
+        | warm run | 20.0 |
+    """
+    rows = dict(spent)
+    whole = rows.pop("first run")
+    fitted = rows.pop("first run, kernels kept")
+    warm = rows.pop("warm run")
+    waits = {
+        "install": rows.pop("install", None),
+        "first run": whole,
+        "of it compiling kernels": whole - fitted,
+        "of it fitting": fitted - warm,
+        "warm run": warm,
+        **rows,
+    }
+    lines = [
+        f"| {name} | {waited_s:.1f} |" for name, waited_s in waits.items() if waited_s is not None
+    ]
+    return "\n".join(["| | passed, s |", "|---|---:|", *lines])
+
+
 def table(pairs: Sequence[tuple[Costs, Costs]]) -> str:
     """Return the medians over pairs of base and here as Markdown; what only one of them measures
     is left out.
@@ -146,11 +241,19 @@ def table(pairs: Sequence[tuple[Costs, Costs]]) -> str:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("base", help="a commit")
+    parser.add_argument("base", nargs="?", help="a commit")
     parser.add_argument("--pairs", type=int, default=6)
     parser.add_argument("--base-python", default=sys.executable)
     parser.add_argument("--renderer", default=",".join(RENDERERS))
+    parser.add_argument("--first-run", action="store_true", help="measure that instead")
+    parser.add_argument("--install", action="store_true", help="of it also the installation")
+    parser.add_argument("--suite", default="suites/first", help="what the first run drives")
     options = parser.parse_args()
+    if options.first_run:
+        print(table_of_waits(first_run(options.suite, options.install)))
+        return
+    if options.base is None:
+        parser.error("name a commit, or --first-run")
     renderers = options.renderer.split(",")
     with checked_out(options.base) as base, tempfile.TemporaryDirectory() as folder:
         caches = [Path(folder) / name for name in ("cache-base", "cache-here")]
