@@ -46,7 +46,7 @@ from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 5  # of what a row holds and how it is measured; part of its key
+VERSION = 6  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip
@@ -68,6 +68,11 @@ class QualityClip:
     sdmap: U8  # (T, H, W, 3)
     t_us: I64  # (T,)
     recorded: SequenceReferences | None = None
+
+    @property
+    def scene(self) -> str:
+        """Name of the drawn scene or recorded street; clips of one scene are not independent."""
+        return str(self.identity.get("scene_id", self.name))
 
     def first(self, frames: int) -> QualityClip:
         """Return the clip's first frames, all of them where it has fewer."""
@@ -192,6 +197,7 @@ def measure(
     return {
         "arm": variant.label,
         "clip": clip.name,
+        "scene": clip.scene,
         "seed": seed,
         "frames": len(clip.t_us),
         "size": list(clip.truth.shape[1:3]),

@@ -113,7 +113,7 @@ def quality(
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
 ) -> None:
     """Measure fixers on recorded clips: PSNR, SSIM, perceptual distances, Warp L1, drift and time,
-    with 95 % intervals over clips.
+    with 95 % intervals over scenes.
 
     Writes quality.json, quality.md and sheets of images side by side; rows of finished clips are
     kept.

@@ -1,10 +1,13 @@
-"""From clips to a table: means with standard deviations over clips, and differences from a baseline
-clip by clip.
+"""From clips to a table: means with standard deviations over scenes, and differences from a baseline
+scene by scene.
 
-Nothing bounds these metrics, so that no sample bounds their mean over other clips: the interval of a
-difference is that of its median, by order statistics, which hold whatever the distribution.
+Clips of one scene are no independent samples: phases of one drive show the same street, cameras of
+one rig the same moment. A scene's value is the mean of its clips, and everything else counts scenes.
 
-A row is one clip under one variant: ``arm``, ``clip``, ``values`` (metric -> number),
+Nothing bounds these metrics, so that no sample bounds their mean over other scenes: the interval of
+a difference is that of its median, by order statistics, which hold whatever the distribution.
+
+A row is one clip under one variant: ``arm``, ``clip``, ``scene``, ``values`` (metric -> number),
 ``ms_per_frame`` (of later blocks; empty where no fixer ran), ``frames``, ``identical``, ``events``,
 ``features`` (vectors of the whole video, for distances between sets of clips).
 """
@@ -31,15 +34,15 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
 
     Args:
         rows: As above; every variant should have every clip.
-        baseline: Variant that the others are compared with, clip by clip.
+        baseline: Variant that the others are compared with, scene by scene.
 
     Returns:
         ``baseline``; ``arms``: VARIANT -> METRIC -> ``mean``, ``spread`` (standard deviation over
-        clips; None of one), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
+        scenes; None of one), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
         ``diff`` (the mean), ``spread``, ``median``, ``median_ci95`` ([low, high], or None with
         ``reason``), ``n_better``, ``n_worse``, ``n``; ``sets``: VARIANT -> METRIC -> a distance of
         all its clips from the true ones (`sets.set_distances`); ``identical``, ``events``,
-        ``frames``, ``clips`` by variant.
+        ``frames``, ``clips``, ``scenes`` by variant.
 
     Raises:
         EvaluatorError: No row of the baseline.
@@ -55,11 +58,12 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     arms: dict[str, Any] = {}
     paired: dict[str, Any] = {}
     sets: dict[str, Any] = {}
-    facts: dict[str, dict[str, Any]] = {"clips": {}, "frames": {}, "identical": {}, "events": {}}
+    names_of_facts = ("clips", "scenes", "frames", "identical", "events")
+    facts: dict[str, dict[str, Any]] = {key: {} for key in names_of_facts}
     for name, by_clip in variants.items():
         clip_rows = list(by_clip.values())
         arms[name] = {
-            metric: _mean([value_of(row, metric) for row in clip_rows], metric)
+            metric: _mean(scene_values(clip_rows, metric), metric)
             for metric in metrics_of(clip_rows)
         }
         if name not in (baseline, TRUTH):
@@ -70,6 +74,7 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         for row in clip_rows:
             events.update(row["events"])
         facts["clips"][name] = len(clip_rows)
+        facts["scenes"][name] = len({str(row["scene"]) for row in clip_rows})
         facts["frames"][name] = sorted({int(row["frames"]) for row in clip_rows})
         facts["identical"][name] = sum(int(row["identical"]) for row in clip_rows)
         facts["events"][name] = dict(events)
@@ -84,6 +89,19 @@ def metrics_of(rows: Sequence[Row]) -> list[str]:
 def value_of(row: Row, metric: str) -> float:
     """Return a clip's value; the time is the median over blocks."""
     return float(np.median(row[MS])) if metric == MS else float(row["values"][metric])
+
+
+def scene_values(rows: Sequence[Row], metric: str) -> list[float]:
+    """Return the mean over clips of every scene, in the order of their first rows."""
+    return _scene_means(rows, [value_of(row, metric) for row in rows])
+
+
+def _scene_means(rows: Sequence[Row], values: Sequence[float]) -> list[float]:
+    """Return the mean by scene of one value a row."""
+    by_scene: dict[str, list[float]] = {}
+    for row, value in zip(rows, values, strict=True):
+        by_scene.setdefault(str(row["scene"]), []).append(value)
+    return [float(np.mean(of_clips)) for of_clips in by_scene.values()]
 
 
 def _carries(row: Row, metric: str) -> bool:
@@ -104,9 +122,10 @@ def _paired(rows: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, A
     pairs = [(rows[clip], baseline[clip]) for clip in rows if clip in baseline]
     out: dict[str, Any] = {}
     for metric in metrics_of([row for pair in pairs for row in pair]):
-        differences = np.array([value_of(a, metric) - value_of(b, metric) for a, b in pairs])
+        by_clip = [value_of(a, metric) - value_of(b, metric) for a, b in pairs]
+        differences = np.array(_scene_means([a for a, _ in pairs], by_clip))
         gains = differences if FACTS[metric].direction == "higher" else -differences
-        interval = median_interval(differences, "clips")
+        interval = median_interval(differences, "scenes")
         out[metric] = {
             "diff": float(np.mean(differences)),
             "spread": _spread(differences.tolist()),

@@ -14,7 +14,7 @@ def markdown(summary: Mapping[str, Any]) -> str:
     """Return the tables of a summary (`alpasim_plugin.lab.video_metrics.summary.summarise`): means,
     differences from the baseline, and distances between sets of clips.
 
-    Cells are the mean and, in brackets, the standard deviation over clips; of differences the mean
+    Cells are the mean and, in brackets, the standard deviation over scenes; of differences the mean
     and, in brackets, the 95 % interval of the median, bold where it excludes zero.
     """
     arms = summary["arms"]
@@ -26,7 +26,7 @@ def markdown(summary: Mapping[str, Any]) -> str:
         lengths = summary["frames"][name]
         frames = str(lengths[0]) if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]}"
         cells = [_cell(metric, values.get(metric)) for metric in metrics]
-        rows.append([name, *cells, f"{summary['clips'][name]} x {frames}"])
+        rows.append([name, *cells, f"{_count(summary, name)} x {frames}"])
     tables = [_table(["variant", *titles, "clips x frames"], rows)]
     if paired:
         rows = [
@@ -36,6 +36,12 @@ def markdown(summary: Mapping[str, Any]) -> str:
         tables.append(_table([f"minus {summary['baseline']}", *titles], rows))
     tables += _set_table(summary["sets"])
     return "\n".join(tables)
+
+
+def _count(summary: Mapping[str, Any], name: str) -> str:
+    """Return the number of clips, after that of scenes where some share one."""
+    clips, scenes = summary["clips"][name], summary["scenes"][name]
+    return f"{clips}" if clips == scenes else f"{scenes} scenes, {clips} clips"
 
 
 def _set_table(sets: Mapping[str, Any]) -> list[str]:

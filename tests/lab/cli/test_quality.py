@@ -193,6 +193,7 @@ def row(variant, clip, psnr, frames=200):
     return {
         "arm": variant,
         "clip": clip,
+        "scene": clip.split("_")[0],
         "seed": 0,
         "frames": frames,
         "values": values,
@@ -220,9 +221,24 @@ def test_means_have_a_spread_over_clips_and_differences_an_interval_of_their_med
     assert "| 3dgs | 24.00 (3.35) |" in markdown(found)
     few = summarise([row for row in rows if row["clip"] in "ab"], "3dgs")["paired"]["f"]["psnr_db"]
     assert few["median_ci95"] is None
-    assert few["reason"] == "needs at least 6 clips, found 2"
+    assert few["reason"] == "needs at least 6 scenes, found 2"
     with pytest.raises(EvaluatorError):
         summarise(rows, "x")
+
+
+def test_phases_and_cameras_of_one_street_are_one_sample():
+    clips = [f"{scene}_{phase}" for scene in "ab" for phase in range(4)]
+    rows = [row("3dgs", clip, 20.0) for clip in clips]
+    rows += [row("f", clip, 21.0 + i % 4 + 10 * (clip[0] == "b")) for i, clip in enumerate(clips)]
+    summary = summarise(rows, "3dgs")
+    assert (summary["clips"]["f"], summary["scenes"]["f"]) == (8, 2)
+    arm = summary["arms"]["f"]["psnr_db"]
+    assert (arm["mean"], arm["n"]) == (27.5, 2)
+    assert arm["spread"] == pytest.approx(np.std([22.5, 32.5], ddof=1))
+    pair = summary["paired"]["f"]["psnr_db"]
+    assert (pair["diff"], pair["n"], pair["n_better"]) == (7.5, 2, 2)
+    assert pair["median_ci95"] is None, "eight clips of two streets are two samples"
+    assert "| 2 scenes, 8 clips x 200 |" in markdown(summary)
 
 
 def test_drift_holds_the_end_against_frames_50_to_100():
