@@ -699,7 +699,9 @@ def observations(
         times = np.arange(place.start_us - 10 * STEP_US, now + 1, STEP_US)
         history = trajectory_from_poses(times, np.array([pose(int(t)) for t in times]))
         specs = {name: read_only(camera) for name, camera in cameras.items()}
-        yield Observation(now, frames, specs, read_only(ego), read_only(history), route)
+        yield Observation(
+            now, frames, specs, read_only(ego), read_only(history), route, road_users={}
+        )
 
 
 def _recorded_observations(
@@ -725,7 +727,14 @@ def _recorded_observations(
             rgb = road.image(camera, road.pose(driven_m), seed=now % 1000)
             frames[name] = read_only(Frame(seen_us, name, rgb))
         route = _route_ahead(scenario.route, ego.T_world_rig)
-        yield Observation(now, frames, specs, read_only(ego), read_only(history), route)
+        road_users = {
+            actor.actor_id: interpolate(actor.track, now)
+            for actor in scenario.actors
+            if actor.track.t_us[0] <= now <= actor.track.t_us[-1]
+        }
+        yield Observation(
+            now, frames, specs, read_only(ego), read_only(history), route, road_users=road_users
+        )
 
 
 def _route_ahead(route: Route, T_world_rig: F64) -> F64:

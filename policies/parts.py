@@ -23,6 +23,12 @@ PARTS = (
     ),
     RegisteredPart(
         kind="policy",
+        name="rule-based",
+        target="policies.rule_based:RuleBased",
+        help="along the route by the map and the boxes of road users: obeys lights and limits, gives way, keeps distance; takes no camera",
+    ),
+    RegisteredPart(
+        kind="policy",
         name="lane-camera",
         target="policies.lane_camera:LaneCamera",
         help="lane markings and obstacles from one front camera, by OpenCV; the route is a weak prior",

@@ -41,7 +41,7 @@ STAGES = {
         A + "fixers.network",
         A + "fixers.semantic_map",
     ),
-    "policies": (),
+    "policies": (A + "world",),
     A + "control": (),
     A + "log.wire": (),
     A + "log": (A + "log.wire",),

@@ -172,6 +172,9 @@ class Policy(Protocol):
     sensors: Sequence[SensorSpec]  # which cameras, at which rate; nothing else is rendered
     # which controller moves the ego along its plans; declared on the class
     controller: str = "bicycle"
+    # whether `Observation.road_users` tells it where the other road users are, which no camera has to
+    # see; a reference, not a policy to be tested behind renderers
+    sees_road_users: bool = False
 
     @abstractmethod
     def reset(self, seed: int, route: Route) -> None:

@@ -392,6 +392,9 @@ class Observation:
     images: Mapping[str, Any] = field(
         default_factory=dict
     )  # images that lie on a device; `image` gives any
+    # where the other road users are, ``T_world_box`` ``(4, 4)`` by id; None unless the policy declares
+    # `alpasim_plugin.core.interfaces.Policy.sees_road_users`
+    road_users: Mapping[str, F64] | None = None
 
     def image(self, camera: str) -> Any:
         """Return a camera's image as a tensor ``(H, W, 3)`` uint8 that the policy may change: of

@@ -107,6 +107,7 @@ class OwnFrames(Policy):
     def __init__(self, policy: Policy, scenario: Scenario) -> None:
         self.policy = complete(policy, Policy)
         self.sensors = policy.sensors
+        self.sees_road_users = self.policy.sees_road_users
         self._start_us = scenario.start_us
         self._period_us = {
             sensor.camera: scenario.period_us(sensor) for sensor in self.policy.sensors
@@ -128,7 +129,8 @@ class OwnFrames(Policy):
             for name, image in observation.images.items()
             if name in frames and frames[name] is observation.frames[name]
         }
-        view = replace(observation, frames=frames, cameras=cameras, images=images)
+        told = observation.road_users if self.sees_road_users else None
+        view = replace(observation, frames=frames, cameras=cameras, images=images, road_users=told)
         with calling(self.policy, "act", PolicyError):
             return self.policy.act(view)
 
@@ -179,6 +181,7 @@ class SwitchedPolicy(Policy):
         self.at_us = at_us
         self.then_seed = then_seed
         self.sensors: Sequence[SensorSpec] = merge_sensors(first.sensors, then.sensors, scenario)
+        self.sees_road_users = self.first.sees_road_users or self.then.sees_road_users
 
     def reset(self, seed: int, route: Route) -> None:
         """Reset both."""

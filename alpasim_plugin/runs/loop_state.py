@@ -50,7 +50,14 @@ def visible_actors(actors: Mapping[str, F64]) -> Mapping[str, F64]:
     """Return the poses of the actors that are drawn, as views that cannot be written: what stands
     in a reconstruction is in its images already.
     """
-    poses = {name: T.view() for name, T in actors.items() if not name.startswith(STANDING_ID)}
+    return read_only_poses(
+        {name: T for name, T in actors.items() if not name.startswith(STANDING_ID)}
+    )
+
+
+def read_only_poses(actors: Mapping[str, F64]) -> Mapping[str, F64]:
+    """Return poses as views that cannot be written."""
+    poses = {name: T.view() for name, T in actors.items()}
     for T in poses.values():
         T.flags.writeable = False
     return poses
@@ -152,7 +159,10 @@ class LoopState:
         return Trajectory(self._t_us[:n], self._xyz[:n], self._quat[:n])
 
     def observe(
-        self, cameras: Mapping[str, CameraSpec], sensors: Sequence[SensorSpec] = ()
+        self,
+        cameras: Mapping[str, CameraSpec],
+        sensors: Sequence[SensorSpec] = (),
+        road_users: Mapping[str, F64] | None = None,
     ) -> Observation:
         """Return the policy's observation at the present instant. Its arrays cannot be written,
         since the world, the fixer's history and the log hold the same ones; its tensors are copies.
@@ -170,6 +180,7 @@ class LoopState:
                 self._route_ahead.in_rig(self.ego.T_world_rig), self.scenario.route_offset_m
             ),
             {name: self.frames[name].image() for name in tensors},
+            None if road_users is None else read_only_poses(road_users),
         )
 
     def to_world(self, plan: Plan) -> list[Trajectory]:

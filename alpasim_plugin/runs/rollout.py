@@ -56,7 +56,8 @@ def run_rollout(
     controller = complete(
         controller or make_controller(policy.controller, scenario.vehicle), Controller
     )
-    loop = Loop(scenario, renderer, checked_sensors(policy), controller, recorder)
+    sensors = checked_sensors(policy)
+    loop = Loop(scenario, renderer, sensors, controller, recorder, policy.sees_road_users)
     reset_policy(policy, seed, scenario.route)
     driving = loop.drive()
     try:
@@ -81,6 +82,7 @@ class Loop:
         sensors: Cameras to render.
         controller: Vehicle model.
         recorder: Records the rollout. Whoever drives calls its ``finish``.
+        tells_road_users: Whether observations say where the other road users are.
 
     Attributes:
         state: The ego and the newest frames.
@@ -95,7 +97,9 @@ class Loop:
         sensors: Sequence[SensorSpec],
         controller: Controller,
         recorder: Recorder,
+        tells_road_users: bool = False,
     ) -> None:
+        self._tells_road_users = tells_road_users
         self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
         self._renderer, self._controller, self._recorder = (
             complete(renderer, Renderer),
@@ -147,7 +151,8 @@ class Loop:
             if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
                 return
             if self._cadence.queries_at(tick.t_us):
-                observation = state.observe(self._rig.specs, self._sensors)
+                told = self.actors if self._tells_road_users else None
+                observation = state.observe(self._rig.specs, self._sensors, told)
                 recorder.policy_query(observation, clock)
                 began = time.perf_counter()
                 with recorder.stage("policy"):

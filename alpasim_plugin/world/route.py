@@ -342,12 +342,12 @@ class RouteAhead:
         self._route = route
         self._last: tuple[float, F64] | None = None
 
-    def follow(self, T_world_rig: F64) -> None:
-        """Move along the route with the ego: as far as it can have come since the last call. Where
-        the ego has left the route and meets it again, the nearest place of the whole route counts.
+    def follow(self, T_world_rig: F64) -> float:
+        """Move along the route with the ego, as far as it can have come since the last call, and
+        return the arc length where it is. Where the ego has left the route and meets it again, the
+        nearest place of the whole route counts. A route of fewer than two points has the place 0.
         """
-        if len(self._route.xyz) >= 2:
-            self._moved_to(T_world_rig)
+        return self._moved_to(T_world_rig)[1] if len(self._route.xyz) >= 2 else 0.0
 
     def in_rig(self, T_world_rig: F64, n: int = 20, spacing_m: float = 80 / 19) -> F64:
         """Follow the ego and return the route ahead of it; see `route_in_rig`."""

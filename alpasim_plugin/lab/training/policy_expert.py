@@ -23,9 +23,10 @@ from alpasim_plugin.world.idm import (
     idm_acceleration,
 )
 from alpasim_plugin.world.path import Lines, Path
+from alpasim_plugin.world.yielding import PredictedBodies, yielding_acceleration
 from policies.base import follow, make_path
 from policies.learned_net import KNOTS_M, TIMES_S, path_grid
-from scenarios.expert import PredictedBodies, ScriptedTracks, yielding_acceleration
+from scenarios.expert import ScriptedTracks
 
 STEP_S = 0.1
 FORECAST_S = 0.5  # between the instants of a forecast
