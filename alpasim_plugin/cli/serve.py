@@ -9,7 +9,7 @@ from typing import Annotated
 
 from alpasim_plugin.alpasim.server.assembly import Settings, Upstream, assemble
 from alpasim_plugin.alpasim.server.driver_service import ADDRESS, DriverService
-from alpasim_plugin.alpasim.server.hosting import Host, HostPolicy
+from alpasim_plugin.alpasim.server.hosting import RENDER_BYTES, Host, HostPolicy
 from alpasim_plugin.cli.output import show
 from alpasim_plugin.core.errors import InputError, Stopped
 from alpasim_plugin.core.flags import Flag
@@ -127,7 +127,7 @@ def _serve_renderer(
 ) -> None:
     """Serve AlpaSim's renderer service until a signal stops it, then print what was counted."""
     made = assemble(renderer.settings(host_policy.expiry_s))
-    host = Host(made.services, listen, host_policy, CALLS_AT_A_TIME, made.expire)
+    host = Host(made.services, listen, host_policy, CALLS_AT_A_TIME, made.expire, RENDER_BYTES)
     text = f"serving {', '.join(made.services)} at {host.address}: {made.spec.name}"
     if renderer.upstream:
         text += f" in front of {renderer.upstream}"

@@ -179,7 +179,7 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
     monkeypatch,
 ):
     monkeypatch.setattr(hosting, "RECEIVING", 4)
-    monkeypatch.setattr(senders, "SENDING_S", 0.5)
+    monkeypatch.setattr(hosting, "SENDING_S", 0.5)
     monkeypatch.setattr(hosting, "UPKEEP_S", 0.1)
     name = "EgodriverService"
     silence = Silence()
@@ -193,7 +193,7 @@ def test_messages_wait_at_their_callers_until_there_is_a_place_and_slow_ones_are
 
 def test_slow_senders_are_cancelled_soon_where_others_wait_for_their_places(monkeypatch):
     monkeypatch.setattr(hosting, "RECEIVING", 4)
-    monkeypatch.setattr(senders, "SENDING_S", 3600.0)
+    monkeypatch.setattr(hosting, "SENDING_S", 3600.0)
     monkeypatch.setattr(senders, "CROWDED_S", 0.2)
     entered = []
     enter = senders.Senders.enter
@@ -227,6 +227,31 @@ def test_slow_senders_are_cancelled_soon_where_others_wait_for_their_places(monk
         for call in calls:
             call.cancel()
         silence.over.set()
+
+
+def test_a_server_that_ends_does_not_wait_for_messages_that_do_not_come():
+    name = "EgodriverService"
+    silence = Silence()
+    with ExitStack() as stack:
+        service = driver_service()[0]
+        host = Host({name: service}, "127.0.0.1:0").start()
+        channel = stack.enter_context(channel_to(host))
+        calls = [say_nothing(name, "get_version")(channel, silence) for _ in range(8)]
+        assert is_served(host, name)
+        host.stop(drain_s=3600.0)
+        assert all(failure(lambda call=call: next(call))[0] for call in calls)
+        silence.over.set()
+
+
+def test_a_message_to_a_renderer_has_a_limit_of_its_own():
+    name = "SensorsimService"
+    crowd = sensorsim_pb2.RGBRenderRequest(dynamic_objects=[sensorsim_pb2.DynamicObject()] * 600)
+    with served(name, message_bytes=1_000) as host, channel_to(host) as channel:
+        render = Stub(channel, name).render_rgb
+        assert failure(lambda: render(crowd))[0] is Code.RESOURCE_EXHAUSTED
+        del crowd.dynamic_objects[400:]
+        assert failure(lambda: render(crowd))[0] is not Code.RESOURCE_EXHAUSTED
+        assert is_served(host, name)
 
 
 class Call:

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import grpc
 
-from alpasim_plugin.alpasim.server.senders import Senders
+from alpasim_plugin.alpasim.server.senders import CROWDED_S, SENDING_S, Senders
 from alpasim_plugin.alpasim.server.status import CallTime, Full, Late
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.files import read_bytes, read_text
@@ -32,6 +32,7 @@ from alpasim_plugin.log.wire.services import MESSAGE_BYTES, V1ALPHA, Reflection,
 
 OPEN_CALLS = SERVICE_PATHS["Health"]  # a load balancer has no token
 LIGHT_CALLS = (OPEN_CALLS, SERVICE_PATHS["ServerReflection"], V1ALPHA)
+RENDER_BYTES = 1 << 20  # of a message to a renderer: the poses of some thousand road users
 CALLS = 512  # threads for calls that are worked on, wait for that, or send their message
 RECEIVING = 32  # calls whose message is in memory and that are not worked on yet
 UNREAD_BYTES = 512 << 20  # of all answers that callers have not taken yet
@@ -385,8 +386,12 @@ class Gate(grpc.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
 
     def cancel_slow(self) -> None:
         """Cancel the calls that have not sent their message, or taken their answer, in time."""
-        self._senders.cancel_slow()
+        self.cancel_slow_senders()
         self._unread.cancel_slow()
+
+    def cancel_slow_senders(self, limit_s: float | None = None) -> None:
+        """Cancel the calls that have not sent their message within a time, by default `SENDING_S`."""
+        self._senders.cancel_slow(SENDING_S if limit_s is None else limit_s)
 
     def _admits(self, metadata: Any) -> bool:
         if self._wanted is None:
@@ -447,7 +452,9 @@ class Host:
         listen: ``HOST:PORT``; port 0 takes a free one. Or ``unix:PATH``.
         policy: Who is let in.
         workers: Calls that are worked on at the same time; further ones wait.
-        every: Called every `UPKEEP_S` seconds, such as to forget what is old.
+        on_interval: Called every `UPKEEP_S` seconds, such as to forget what is old.
+        message_bytes: Size of the largest message that is received. Parsed, one may take fifty
+            times as much memory.
 
     Raises:
         InputError: An invalid address, or files of the policy that cannot be read.
@@ -461,12 +468,13 @@ class Host:
         policy: HostPolicy = HostPolicy(),
         workers: int = 16,
         on_interval: Callable[[], None] = lambda: None,
+        message_bytes: int = MESSAGE_BYTES,
     ) -> None:
         self.health = Health(services)
         # No maximum_concurrent_rpcs: beyond it gRPC answers RESOURCE_EXHAUSTED, which AlpaSim does
         # not retry. Calls wait instead.
         options = [
-            ("grpc.max_receive_message_length", MESSAGE_BYTES),
+            ("grpc.max_receive_message_length", message_bytes),
             ("grpc.max_send_message_length", MESSAGE_BYTES),
             ("grpc.so_reuseport", 0),
             ("grpc.max_concurrent_streams", STREAMS),
@@ -518,10 +526,12 @@ class Host:
 
     def stop(self, drain_s: float = 30.0) -> None:
         """Refuse new calls (UNAVAILABLE), let running ones finish within ``drain_s``, and close the
-        port.
+        port. Calls whose message does not come are not waited for.
         """
         self.health.is_serving = False
-        self._server.stop(drain_s).wait()
+        ended = self._server.stop(drain_s)
+        while not ended.wait(CROWDED_S):
+            self._gate.cancel_slow_senders(CROWDED_S)
         self._ended.set()
         if self._upkeep.is_alive():
             self._upkeep.join()

@@ -48,9 +48,9 @@ class Senders:
             with self._lock:
                 self._waiting -= 1
 
-    def cancel_slow(self) -> None:
-        """Cancel the calls that have not sent their message in time."""
-        latest_s = time.monotonic() - SENDING_S
+    def cancel_slow(self, limit_s: float) -> None:
+        """Cancel the calls that have not sent their message within a time."""
+        latest_s = time.monotonic() - limit_s
         with self._lock:
             slow = [context for context, since_s in self._since_s.items() if since_s < latest_s]
         for context in slow:
