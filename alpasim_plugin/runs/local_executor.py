@@ -23,6 +23,7 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
 from multiprocessing.reduction import ForkingPickler
+from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -49,6 +50,7 @@ R = TypeVar("R")
 OVERTIME_S = 3.0  # after the time limit, for a worker to end by itself
 POLL_S = 0.5  # the end of a worker goes unnoticed where a copy of it holds its pipe
 UNREACHABLE = 74  # exit code of a worker that cannot hand over its result (EX_IOERR)
+LAST = -1_000  # priority of what is done at the end of a worker, after everything else
 LEAVE_S = 10.0  # for idle workers, to end the commands that they have started
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -502,7 +504,9 @@ def _serve(connection: Connection, note: Path) -> None:
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    os._exit(0)  # a thread that a part has started does not keep the process
+    # What multiprocessing has noted goes first, such as named semaphores, which the system keeps
+    # otherwise; and a thread that a part has started does not keep the process.
+    Finalize(None, os._exit, args=(0,), exitpriority=LAST)
 
 
 def _sendable(error: BaseException) -> Exception:

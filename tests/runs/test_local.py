@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -212,3 +213,22 @@ def test_what_a_job_leaves_running_ends_with_a_worker_that_dies(tmp_path, name):
     left = [int(line) for line in numbers.read_text().split()]
     assert left
     assert all(map(is_gone, left))
+
+
+def compile_a_kernel(item):
+    """Let Numba make its lock between processes, as it does when it compiles."""
+    import numba
+
+    threading.Thread(target=time.sleep, args=(3600,)).start()  # which does not keep the worker
+    return numba.get_num_threads()
+
+
+def test_workers_leave_no_semaphore_to_the_system():
+    script = (
+        "from tests.runs import test_local as t\n"
+        "print(len(list(t.run_jobs(t.compile_a_kernel, [1, 2, 3], 2))))"
+    )
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, check=True, timeout=280, capture_output=True, text=True)
+    assert done.stdout == "3\n"
+    assert "semaphore" not in done.stderr
