@@ -229,8 +229,8 @@ def _turned_share(plan: LoggedPlan) -> float | None:
 
 def speed_fact(failure: Failure) -> str:
     """Say where the ego drives much faster than the recording at the same place: in the second
-    before, or, before a contact, where the recording did not slow down yet; empty where it does
-    not.
+    before, or, before a contact, where the recording did not slow down yet. Where the recording did,
+    say whether the ego is much faster than the recording is anywhere before; empty where it is not.
     """
     approach = failure.approach
     if approach is None or failure.is_slow:
@@ -242,17 +242,40 @@ def speed_fact(failure: Failure) -> str:
         comparable &= approach.t_us >= approach.t_us[-1] - LAST_US
     elif comparable.any():
         comparable &= recorded >= 0.9 * np.nanmax(recorded)
-    is_faster = comparable & (v > FASTER * recorded) & (v > recorded + FASTER_MPS)
+    is_faster = comparable & (_margin_mps(v, recorded) > 0.0)
     if not is_faster.any():
-        return ""
+        return "" if failure.contact is None else _above_fastest_fact(approach)
     worst = int(np.flatnonzero(is_faster)[np.argmax((v - recorded)[is_faster])])
     before_s = (approach.t_us[-1] - approach.t_us[worst]) * 1e-6
-    posted = "" if approach.limit_mps is None else f"; {approach.limit_mps:.1f} m/s are posted"
     moment = f"{before_s:.1f} s before the failure" if before_s >= 0.05 else "At the failure"
     return (
         f"{moment} it drives {v[worst]:.1f} m/s "
-        f"where the recording drives {recorded[worst]:.1f} m/s{posted}."
+        f"where the recording drives {recorded[worst]:.1f} m/s{_posted_words(approach)}."
     )
+
+
+def _above_fastest_fact(approach: Approach) -> str:
+    """Say by what the ego is much faster at a failure than the recording is anywhere in the seconds
+    before; empty where it is not.
+    """
+    if not np.isfinite(approach.recorded_mps).any():
+        return ""
+    fastest_mps = float(np.nanmax(approach.recorded_mps))
+    if not _margin_mps(approach.speed_mps, fastest_mps)[-1] > 0.0:
+        return ""
+    return (
+        f"At the failure it drives {approach.speed_mps[-1]:.1f} m/s; up to there the recording drives at most "
+        f"{fastest_mps:.1f} m/s{_posted_words(approach)}."
+    )
+
+
+def _margin_mps(speed_mps: F64, recorded_mps: F64 | float) -> F64:
+    """Return by how much speeds ``(T,)`` are above what counts as much faster than recorded."""
+    return speed_mps - np.maximum(FASTER * recorded_mps, recorded_mps + FASTER_MPS)
+
+
+def _posted_words(approach: Approach) -> str:
+    return "" if approach.limit_mps is None else f"; {approach.limit_mps:.1f} m/s are posted"
 
 
 def side_fact(failure: Failure) -> str:

@@ -110,6 +110,24 @@ def test_plans_that_brake_no_more_are_told_from_those_that_never_did():
     )
 
 
+def test_a_contact_says_that_the_ego_is_faster_than_a_recording_that_slows_down_ever_is():
+    slowing = np.clip(9.0 - 1.5 * TIMES, 0.0, None)
+    recorded = track(np.concatenate([[0.0], np.cumsum(0.1 * slowing)[:-1]]), 0.0)
+
+    def sentences_at(accel_mps2):
+        x = 9.0 * TIMES + accel_mps2 * TIMES**2 / 2
+        stands = car("stands", track(np.full(60, x[-1] + 4.855 / 2 + 2.25), 0.0))
+        log = plans_at(rollout(track(x, 0.0), [stands], log=recorded), 9.0 + accel_mps2 * TIMES)
+        contact = Contact("stands", 5.9, "front", 3.8, 0.0)
+        return facts_of(log, frozenset({"collision_any"}), contact, [LANE])
+
+    assert sentences_at(1.0)[0] == (
+        "At the failure it drives 14.8 m/s; up to there the recording drives at most 9.0 m/s; "
+        "13.9 m/s are posted."
+    )
+    assert sentences_at(0.0)[0].startswith("In the last second no plan brakes")
+
+
 def test_a_slow_drive_says_who_is_ahead_and_whether_in_the_way():
     recorded = track(10.0 * 0.1 * np.arange(200), 0.0)
     x = np.concatenate([TIMES[:30] * 10.0, np.full(30, 29.0) + 0.5 * TIMES[:30]])
