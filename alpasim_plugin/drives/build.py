@@ -32,7 +32,7 @@ from alpasim_plugin.drives.placing import (
     place,
 )
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
-from alpasim_plugin.drives.quality import measure, write_page
+from alpasim_plugin.drives.quality import measure, require_covered, write_page
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
 from alpasim_plugin.gaussians.fit.drive import fit_drive
@@ -55,6 +55,10 @@ RENDER_PX = 640  # most of the longer side of the scenario's cameras
 SIDE_PX = 16  # what the sides of these cameras are multiples of, as fixers need
 SEED = 0  # of the fit
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
+THIN_MODEL_HINT = (
+    "Check that the poses belong to the photographs, and give photographs that overlap and show the "
+    "road: a policy would drive through nothing."
+)
 Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
 
 
@@ -115,8 +119,8 @@ def import_drive(
         What ``quality.json`` holds.
 
     Raises:
-        InputError: Anything wrong with the recording, or ``out`` is something else; nothing is left
-            behind then.
+        InputError: Anything wrong with the recording, its model covers nearly nothing of what the
+            cameras see, or ``out`` is something else; nothing is left behind then.
         InfrastructureError: The disk refuses, or there is no such device.
     """
     require_device(device)
@@ -195,6 +199,8 @@ def _built(
     quality = write_folder(
         work, drive, placed, roads, done.model, photographs, views, done.exposures, tell
     )
+    on_path = next(row for row in quality["coverage"] if row["lateral_m"] == 0.0)
+    require_covered(folder, on_path["share"], THIN_MODEL_HINT)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
 

@@ -11,6 +11,7 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.escape import markdown as escape
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.geometry import inverse, left_of, shifted, unit
@@ -30,6 +31,7 @@ OPAQUE = 0.5
 STANDING_M = 0.1  # from one photograph to the next but one
 EXAMPLES = 3  # photographs of each use on the page
 COVERED = 8  # views that measure coverage
+LEAST_COVERED = 0.3  # of the lower half of the images: a model of less is refused
 IMAGES = "images"
 Report = Callable[[str, int, int], None]
 
@@ -103,6 +105,25 @@ def _left_of_path(views: Sequence[PosedView], view: PosedView) -> F64:
     if np.hypot(*way[:2]) < STANDING_M:
         return np.asarray(-inverse(view.camera.T_camera_world)[:3, 0], dtype=np.float64)
     return np.array([*left_of(unit(way[:2])), 0.0])
+
+
+def require_covered(source: Path, covered: float, hint: str) -> None:
+    """Refuse a model that covers nearly nothing of what its own drive sees.
+
+    Args:
+        source: What was imported.
+        covered: Share of the lower half of the images.
+        hint: What to do.
+
+    Raises:
+        InputError: It is less than `LEAST_COVERED`.
+    """
+    if covered < LEAST_COVERED:
+        raise InputError(
+            f"{source}: from the poses the model covers {100 * covered:.1f} % of the images' lower "
+            f"half, less than {100 * LEAST_COVERED:.0f} %",
+            hint,
+        )
 
 
 def _covered(graph: SceneGraph, view: PosedView, offset: F64) -> float:

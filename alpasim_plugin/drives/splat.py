@@ -27,6 +27,7 @@ from alpasim_plugin.drives.build import (
 from alpasim_plugin.drives.held_out import EVERY, EVERY_STILL
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import PlacedDrive, check_motion, place
+from alpasim_plugin.drives.quality import require_covered
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import CleanReport, GaussianCloud, placed_cloud, require_rigid
@@ -54,7 +55,6 @@ TRAINED_FRAME = Fields(TRAINED, read={"file": "transform scale"}, harmless={}, o
 SWAPPED = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))  # applied before it was stated
 VIEWS = 8  # that coverage is measured on
 OPAQUE_PIXEL = 0.5  # opacity from which the model covers a pixel
-LEAST_COVERED = 0.3  # of the lower half of the images
 MOST_ROLL_DEG = 20.0  # of the camera against the ground
 
 
@@ -195,11 +195,11 @@ def _in_frame(
     if stated is not None:
         coverage = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
         notes = (f"the model is taken {best}: from the poses it covers {coverage}",)
-    if covered < LEAST_COVERED:
-        raise InputError(
-            f"{file}: from the poses it covers {100 * covered:.1f} % of the images' lower half, less than {100 * LEAST_COVERED:.0f} %",
-            f"Give the poses in the model's own frame and unit; {TRAINED} of nerfstudio is read where it lies beside the model.",
-        )
+    hint = (
+        f"Give the poses in the model's own frame and unit; {TRAINED} of nerfstudio is read where it "
+        "lies beside the model."
+    )
+    require_covered(file, covered, hint)
     return moved, notes
 
 

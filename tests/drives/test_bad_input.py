@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.drives import build
 from alpasim_plugin.drives.build import import_drive
+from tests.drives.conftest import at_once
 from tests.drives.street import HEIGHT, WIDTH, edited, write_colmap, write_transforms
 
 pytestmark = pytest.mark.slow
@@ -177,3 +179,15 @@ def test_a_whole_benchmark_sequence_is_refused_at_once(tmp_path, walk):
         document["frames"] = [frame for _ in range(30) for frame in document["frames"]]
     with pytest.raises(InputError):
         import_drive(folder, tmp_path / "out")
+
+
+def test_a_fit_that_covers_nearly_nothing_is_refused_and_leaves_nothing(
+    tmp_path, kitti_street, monkeypatch
+):
+    def fit_few(views, start, **rest):
+        return at_once(views, start.take(np.arange(20)), **rest)
+
+    monkeypatch.setattr(build, "fit_drive", fit_few)
+    with pytest.raises(InputError, match=r"street: from the poses the model covers [0-9.]+ %"):
+        import_drive(kitti_street, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
