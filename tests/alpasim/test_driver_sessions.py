@@ -66,3 +66,20 @@ def test_a_driver_that_is_started_here_is_tried_with_a_read_only_root_and_anew(s
     assert results[""][:2] == (0, "passed")
     assert results[" needs-its-folder"][:2] == (1, "failed")
     assert "cannot write to" in results[" needs-its-folder"][2]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+def test_a_driver_that_writes_and_one_that_remembers_earlier_processes_fail(scene, tmp_path):
+    written = PROGRAM.with_name("__pycache__") / "written_by_a_session.txt"  # not below /tmp
+    written.parent.mkdir(exist_ok=True)
+    words = f"{sys.executable} {PROGRAM} writes-to={written} counts-in={tmp_path / 'processes'}"
+    findings = {one.name: one for one in session_findings(load_scenario(scene), f"exec:{words}")}
+    assert written.exists()
+    written.unlink()
+    assert findings[ANEW].result == "failed"
+    assert "plans of a new process differ by up to" in findings[ANEW].text
+    if findings[READ_ONLY].result == "noted":
+        pytest.skip("this machine makes no read-only root")
+    assert findings[READ_ONLY].result == "failed"
+    assert "Read-only file system" in findings[READ_ONLY].text
