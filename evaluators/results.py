@@ -547,6 +547,8 @@ class Summary:
             whose plans do.
         drive_calls: POLICY -> its drive calls against the challenge's budget; only of AlpaSim's
             drivers.
+        unlit_frames: RENDERER -> frames without depth in which traffic lights in view could not be
+            drawn.
         pool: Throughput of the workers; None where nothing was driven.
         repeat: What ``--repeat`` found.
         exit_code: Of ``simrun score``.
@@ -569,6 +571,7 @@ class Summary:
     speed: dict[str, Speed] = field(default_factory=dict)
     slowing: dict[str, Slowing] = field(default_factory=dict)
     drive_calls: dict[str, DriveCalls] = field(default_factory=dict)
+    unlit_frames: dict[str, int] = field(default_factory=dict)
     pool: Pool | None = None
     repeat: Repeat | None = None
     exit_code: int | None = None

@@ -113,6 +113,7 @@ class WeatherRenderer(Renderer):
         self.block = self.base.block
         self.has_history = self.base.has_history
         self.draws_lenses = self.base.draws_lenses
+        self.unlit_frames = 0
         self.is_clear = scenario.environment == scenario.environment.in_clear_day
         self.lights = SceneLights(scenario)
         self.light_rgb = np.array(LIGHT_RGB[scenario.environment.time], dtype=np.float32)
@@ -147,13 +148,14 @@ class WeatherRenderer(Renderer):
         ]
 
     def facts(self) -> Mapping[str, Any]:
-        """Return the base renderer's facts and the weather."""
-        return {**self.base.facts(), "environment": asdict(self.scenario.environment)}
+        """Return the base renderer's facts, the weather, and in how many frames of a renderer without
+        depth a traffic light in view could not be drawn.
+        """
+        unlit = {"unlit_frames": self.unlit_frames} if self.unlit_frames else {}
+        return {**self.base.facts(), "environment": asdict(self.scenario.environment), **unlit}
 
     def _shown(self, request: RenderRequest, frame: Frame) -> Frame:
-        if frame.depth is None:
-            if self.is_clear:
-                return frame
+        if frame.depth is None and not self.is_clear:
             raise RendererError(
                 f"weather over {type(self.base).__name__}: its frame has no depth",
                 "Remove environment.time, rain, snow and fog_visibility_m, or let the renderer return depth",
@@ -164,6 +166,9 @@ class WeatherRenderer(Renderer):
         if request.exposure is not None:
             T_world_camera, actors = at_share(request, 0.5)
         if self._is_as_rendered(camera, T_world_camera, actors, request.t_us):
+            return frame
+        if frame.depth is None:
+            self.unlit_frames += 1
             return frame
         rgb = frame.rgb
         depth = frame.depth if self.built is None else self.built.of_request(request)

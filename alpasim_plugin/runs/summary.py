@@ -99,6 +99,7 @@ def summary_of(info: RunInfo, manifests: Sequence[Manifest], rollouts: pa.Table)
         ),
         slowing=slowing_of(finished),
         drive_calls=drive_calls_of(finished),
+        unlit_frames=unlit_frames_of(manifests),
         pool=info.pool,
         repeat=info.repeat,
         exit_code=info.exit_code,
@@ -236,6 +237,17 @@ def drive_calls_of(manifests_by_policy: Mapping[str, Sequence[Manifest]]) -> dic
                 longest_s=max(fact["drive_longest_s"] for fact in timed),
             )
     return calls
+
+
+def unlit_frames_of(manifests: Sequence[Manifest]) -> dict[str, int]:
+    """Return the frames of each renderer in which traffic lights in view could not be drawn; behind
+    a fixer, which speaks for itself alone, they are not counted.
+    """
+    counts: Counter[str] = Counter()
+    for manifest in manifests:
+        facts = manifest.renderer_facts or {}
+        counts[manifest.renderer] += int(facts.get("unlit_frames", 0))
+    return {renderer: count for renderer, count in counts.items() if count}
 
 
 def _stage(durations: Sequence[float], all_ms: float, frames: int) -> StageSpeed:

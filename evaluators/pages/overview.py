@@ -14,7 +14,7 @@ from evaluators.metrics.outcomes import NO_OUTCOME, NOT_RUN, OUTCOMES, REACHED_E
 from evaluators.pages.decision import verdict_text
 from evaluators.pages.fixers import fixer_cautions
 from evaluators.pages.measured import measured_cautions
-from evaluators.pages.policies import drive_call_lines, policy_cautions
+from evaluators.pages.policies import drive_call_lines, policy_cautions, unlit_lines
 from evaluators.results import Difference, Endings, Mean
 from evaluators.statistics.decision import read_decision
 from evaluators.statistics.numbers import (
@@ -165,6 +165,7 @@ class Overview:
         unit: Of the differences.
         decision: What is decided about the differences.
         cautions: What a reader must know.
+        remarks: What is measured beside, and is as it should be.
     """
 
     context: str
@@ -174,6 +175,7 @@ class Overview:
     higher_is_better: bool
     decision: str
     cautions: tuple[str, ...]
+    remarks: tuple[str, ...] = ()
 
     @property
     def failing(self) -> list[VariantRow]:
@@ -327,8 +329,13 @@ def overview_of(run: Run) -> Overview:
         parts.append(f"policy {run.policies[0]}")
     elif len(run.renderers) == 1:
         parts.append(f"renderer {run.renderers[0]}")
-    cautions = [*fixer_cautions(summary), *measured_cautions(summary)]
-    cautions += [*policy_cautions(run), *drive_call_lines(run)]
+    cautions = [
+        *fixer_cautions(summary),
+        *measured_cautions(summary),
+        *policy_cautions(run),
+        *drive_call_lines(run, late=True),
+        *unlit_lines(run),
+    ]
     if summary.copies:
         cautions.append(
             f"{summary.copies} of {plural(len(run.rollouts), 'rollout')} are copies: "
@@ -354,6 +361,7 @@ def overview_of(run: Run) -> Overview:
         if decision is None
         else verdict_text(decision),
         tuple(cautions),
+        tuple(drive_call_lines(run, late=False)),
     )
 
 

@@ -1,4 +1,6 @@
-"""What a reader must know of the policies of a run, whether a rollout failed or not."""
+"""What a reader must know of the policies and the renderers of a run, whether a rollout failed or
+not.
+"""
 
 from evaluators.statistics.numbers import plural, short
 from evaluators.statistics.opening import Run
@@ -32,11 +34,23 @@ def policy_cautions(run: Run) -> list[str]:
     return cautions
 
 
-def drive_call_lines(run: Run) -> list[str]:
-    """Say how the drive calls of AlpaSim's drivers stand to the challenge's budget."""
+def drive_call_lines(run: Run, late: bool) -> list[str]:
+    """Say how the drive calls of AlpaSim's drivers stand to the challenge's budget: of those with
+    late calls, or of the others.
+    """
     return [
         f"{policy}: {plural(calls.calls, 'drive call')} took {short(calls.seconds)} s of the "
         f"challenge's budget of {short(calls.budget_s)} s; "
         f"{calls.late} took longer, the longest {short(calls.longest_s)} s."
         for policy, calls in run.summary.drive_calls.items()
+        if (calls.late > 0) == late
+    ]
+
+
+def unlit_lines(run: Run) -> list[str]:
+    """Say which renderers gave no depth, so that no traffic light was drawn into their frames."""
+    return [
+        f"{renderer} gives no depth, so no traffic light was drawn into {plural(count, 'frame')} "
+        "that look at one: a policy sees a lit one only where the renderer shows it by itself."
+        for renderer, count in run.summary.unlit_frames.items()
     ]

@@ -129,6 +129,8 @@ def overview_lines(overview: Overview, width: int) -> list[Text]:
         lines += [Text(line, "bold") for line in _wrapped(overview.decision, width)]
     for caution in overview.cautions:
         lines += [Text(line, "yellow") for line in _wrapped(f"caution: {caution}", width)]
+    for remark in overview.remarks:
+        lines += [Text(line, "dim") for line in _wrapped(remark, width)]
     for line in lines:
         line.no_wrap = True
         line.overflow = "ignore"

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from alpasim_plugin.cli.main import run_command
-from alpasim_plugin.runs.summary import drive_calls_of, slowing_of
+from alpasim_plugin.runs.summary import drive_calls_of, slowing_of, unlit_frames_of
 from evaluators.pages.overview import overview_of
 from evaluators.results import DriveCalls, Slowing
 from evaluators.statistics.opening import read_run
@@ -107,3 +107,18 @@ def test_drive_calls_of_a_driver_are_said_beside_the_challenge_s_budget(run):
     assert (
         "40\u00a0drive calls took 3.00 s of the challenge's budget of 4.00 s; 2 took longer" in line
     )
+    in_time = {"driver": replace(calls["driver"], late=0)}
+    punctual = overview_of(replace(driven, summary=replace(driven.summary, drive_calls=in_time)))
+    assert "drive calls" not in " ".join(punctual.cautions).replace("\u00a0", " ")
+    assert "0 took longer" in punctual.remarks[0]
+
+
+def test_traffic_lights_that_a_renderer_without_depth_does_not_show_are_said(run):
+    dark = SimpleNamespace(renderer="flat", renderer_facts={"unlit_frames": 3})
+    lit = SimpleNamespace(renderer="clean", renderer_facts=None)
+    assert unlit_frames_of([dark, dark, lit]) == {"flat": 6}
+    driven = read_run(run)
+    assert not any("traffic light" in text for text in overview_of(driven).cautions)
+    unlit = replace(driven, summary=replace(driven.summary, unlit_frames={"flat": 6}))
+    (line,) = [text for text in overview_of(unlit).cautions if "traffic light" in text]
+    assert line.startswith("flat gives no depth, so no traffic light was drawn into 6\u00a0frames")

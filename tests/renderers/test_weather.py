@@ -532,6 +532,16 @@ def test_a_renderer_without_depth_cannot_be_put_into_weather():
     assert not in_weather(Flat(), with_signal, 0).render(request).rgb.any()
 
 
+@pytest.mark.parametrize(("heading_rad", "unlit"), [(0.0, 2), (np.pi, None)])
+def test_frames_without_depth_that_look_at_a_traffic_light_are_counted(heading_rad, unlit):
+    scenario = scene(signals=(signal((("red", 1_000_000),), heading_rad),))
+    spec = replace(scenario.cameras[0], name="front", width=100, height=60, K=K)
+    renderer = WeatherRenderer(Flat(), scenario, 0)
+    for t_us in (0, 100_000):
+        renderer.render(RenderRequest(t_us, spec, np.stack([AHEAD, AHEAD]), {}))
+    assert renderer.facts().get("unlit_frames") == unlit
+
+
 @pytest.mark.parametrize(
     "given",
     [
