@@ -1,11 +1,13 @@
 """Read the golden logs for parity tests: a log with its scene, and AlpaSim's own scores of it.
 
-``python -m tests.evaluators.golden DATA/alpasim-golden`` prints the parity table over all its logs.
+``python -m tests.evaluators.golden DATA/alpasim-golden`` prints the parity table over all its logs;
+with a second folder, in which another version of AlpaSim's evaluation has scored ``rollouts``, it
+compares with that one, under the preset that is named third.
 """
 
 import json
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from alpasim_plugin.log import read_asl
-from evaluators import score
+from evaluators import PRESETS, score
 from evaluators.alpasim import (
     EvalSettings,
     ScoredRollout,
@@ -199,5 +201,86 @@ def parity_table(root):
     return "\n".join([*lines, *(tally.row(name) for name, tally in tables.items())])
 
 
+@dataclass
+class Compared:
+    """What the comparison with another version of the evaluation gave.
+
+    Attributes:
+        values: How many step values both have.
+        unequal: Of these, how many differ by metric (`close`).
+        only: Rows that one side alone has, by side and metric.
+        scores: Number of scene scores that both have.
+        unequal_scores: Scene and rollout, theirs and ours, of those that differ.
+    """
+
+    values: int
+    unequal: Counter[str]
+    only: Counter[tuple[str, str]]
+    scores: int
+    unequal_scores: list[tuple[str, str, float | None, float | None]]
+
+
+def compare_with(root, evaluated, version=PRESETS["alpasim"]):
+    """Compare the scores of the logs of ``rollouts`` with those of another version of AlpaSim's
+    evaluation.
+
+    Args:
+        root: Folder of the golden logs.
+        evaluated: Its ``rollouts/*/*/metrics.parquet``, ``aggregate/results-summary.json`` and
+            ``eval-config.yaml``; logs that it lacks are not compared.
+        version: Which rules of ours.
+    """
+    settings = load_settings(evaluated / "eval-config.yaml")
+    chosen = settings.preset(version)
+    compared = Compared(0, Counter(), Counter(), 0, [])
+    rollouts = []
+    for table in sorted(evaluated.glob("rollouts/*/*/metrics.parquet")):
+        scene, name = table.parts[-3:-1]
+        log = root / "rollouts" / scene / name / "rollout.asl"
+        series = scored(log, root / "scenes" / f"{scene}.usdz", chosen)
+        rollouts.append(ScoredRollout(scene, name, series, *RUN))
+        compare_steps(compared, series, table)
+    summary = json.loads((evaluated / "aggregate/results-summary.json").read_text())
+    theirs = {
+        (row["clipgt_id"], row["rollout_id"]): row.get("score") for row in summary["rollouts"]
+    }
+    ours = {
+        (reduced.scored.scene, reduced.scored.rollout): None
+        if reduced.dropped
+        else scene_score(reduced.values, settings.scene_score).score
+        for reduced in reduce_run(rollouts, chosen)
+    }
+    for key in sorted(theirs.keys() | ours.keys()):
+        pair = theirs.get(key), ours.get(key)
+        compared.scores += None not in pair
+        if None in pair or not close(*pair):
+            compared.unequal_scores.append((*key, *pair))
+    return compared
+
+
+def compare_steps(compared, series, table):
+    """Count the equal step values of one log."""
+    ours = {
+        (one.name, int(t_us)): float(value)
+        for one in series
+        for t_us, value in zip(one.t_us, one.value, strict=True)
+    }
+    columns = pq.read_table(table, columns=["name", "timestamps_us", "values"]).to_pydict()
+    theirs = {
+        (name, int(t_us)): value
+        for name, t_us, value in zip(*columns.values(), strict=True)
+        if t_us is not None
+    }
+    compared.only.update(("theirs", name) for name, _ in theirs.keys() - ours.keys())
+    compared.only.update(("ours", name) for name, _ in ours.keys() - theirs.keys())
+    both = theirs.keys() & ours.keys()
+    compared.values += len(both)
+    compared.unequal.update(key[0] for key in both if not close(ours[key], theirs[key]))
+
+
 if __name__ == "__main__":
-    print(parity_table(Path(sys.argv[1])))
+    folders = [Path(argument) for argument in sys.argv[1:3]]
+    if len(folders) == 1:
+        print(parity_table(folders[0]))
+    else:
+        print(compare_with(*folders, *(PRESETS[name] for name in sys.argv[3:])))
