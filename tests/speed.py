@@ -125,6 +125,9 @@ def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> 
     """
     threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     environment = os.environ | threads | {"PYTHONPATH": str(tree), "SIMRUN_CACHE": str(cache)}
+    # Warm processes read bytecode, as a user's do, whatever this environment says of writing it.
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    environment["PYTHONPYCACHEPREFIX"] = str(cache / "bytecode")
     costs: dict[str, float] = {}
     for script, arguments in ((RASTER, ()), (LOOP, renderers), (JOB, renderers)):
         command = [python, "-c", script, *arguments]
