@@ -7,14 +7,15 @@ both; a ratio is the median of those of the pairs. Numbers are printed and nothi
 The commit is checked out beside this one for the time of the measurement. Where it needs libraries
 of its own, ``--base-python`` names an interpreter that has them.
 
-The first run is that of a clone of what is committed, with an empty home, in passed time. The same
-command is given again with its kernels kept, and then with its fits kept as well: what each of them
-takes is the difference.
+The first run is that of a clone of what is committed, with an empty home. The same command is given
+again with its kernels kept, and then with its fits kept as well: what each of them takes is the
+difference.
 """
 
 import argparse
 import json
 import os
+import resource
 import shutil
 import statistics
 import subprocess
@@ -24,6 +25,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 REPO = Path(__file__).resolve().parents[1]
 RENDERERS = ("clean", "3dgs", "onefixer")
@@ -96,6 +98,9 @@ print(json.dumps({"main job": 1e3 * (used.ru_utime + used.ru_stime)}))
 """
 
 
+FIRST = "first"
+FITTING = "kernels-kept"
+WARM = "warm"
 # The first line of the README's main job.
 INSTALL = """
 python3 -m venv .venv
@@ -138,84 +143,92 @@ def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> 
     return costs
 
 
-def first_run(suite: str, install: bool) -> Mapping[str, float]:
-    """Measure what a user waits for in a clone with an empty home, seconds passed.
+class Wait(NamedTuple):
+    """Seconds of a command: those that passed, and those of processors."""
+
+    passed_s: float
+    processor_s: float
+
+    def less(self, other: "Wait") -> "Wait":
+        """Return by how much this takes longer than another."""
+        return Wait(self.passed_s - other.passed_s, self.processor_s - other.processor_s)
+
+
+def wait_for(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Wait:
+    """Run a command in a folder and return what it took.
+
+    A run in which a variant fails ends with 1, an undecided one with 3.
+    """
+
+    def used_s() -> float:
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime + used.ru_stime
+
+    began = time.perf_counter()
+    used_before_s = used_s()
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True)
+    if done.returncode not in (0, 1, 3):
+        sys.exit(done.stderr.decode())
+    return Wait(time.perf_counter() - began, used_s() - used_before_s)
+
+
+def first_run(suite: str, install: bool) -> Mapping[str, Wait]:
+    """Measure what a user waits for in a clone with an empty home.
 
     Args:
         suite: What is driven.
         install: Whether the README's installation is measured too; else this interpreter's
             libraries are used.
-
-    Raises:
-        subprocess.CalledProcessError: The clone cannot be installed.
     """
-    spent: dict[str, float] = {}
+    waits: dict[str, Wait] = {}
     with tempfile.TemporaryDirectory() as folder:
         clone = Path(folder) / "clone"
         home = Path(folder) / "home"
         home.mkdir()
         subprocess.run(["git", "clone", "-q", str(REPO), str(clone)], check=True)
         environment = os.environ | {"HOME": str(home), "PYTHONPATH": str(clone)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
         environment["SIMRUN_CACHE"] = str(home / "cache")
         environment["NUMBA_CACHE_DIR"] = str(home / "kernels")
         python = sys.executable
         if install:
-            began = time.perf_counter()
-            subprocess.run(["bash", "-c", INSTALL], check=True, cwd=clone, env=environment)
-            spent["install"] = time.perf_counter() - began
+            waits["install"] = wait_for(["bash", "-ec", INSTALL], clone, environment)
             python = str(clone / ".venv/bin/python")
-        command = [python, "-m", "alpasim_plugin.cli.main", "--renderer", ",".join(RENDERERS)]
-        command += ["--policy", "lane-camera", suite]
-        for name in ("first run", "first run, kernels kept", "warm run"):
-            if name == "first run, kernels kept":
+        simrun = [python, "-m", "alpasim_plugin.cli.main"]
+        job = [*simrun, "--renderer", ",".join(RENDERERS), "--policy", "lane-camera", suite]
+        for name in (FIRST, FITTING, WARM):
+            if name == FITTING:
                 shutil.rmtree(home / "cache")
-            began = time.perf_counter()
-            done = subprocess.run(command, cwd=clone, env=environment, capture_output=True)
-            spent[name] = time.perf_counter() - began
-            if done.returncode not in (0, 1, 3):
-                sys.exit(done.stderr.decode())
-        began = time.perf_counter()
-        subprocess.run(
-            [python, "-m", "alpasim_plugin.cli.main", "report"],
-            cwd=clone,
-            check=True,
-            env=environment,
-            capture_output=True,
-        )
-        spent["report again"] = time.perf_counter() - began
-    return spent
+            waits[name] = wait_for([*job, "--out", str(home / name)], clone, environment)
+        report = [*simrun, "report", str(home / WARM)]
+        waits["report"] = wait_for(report, clone, environment)
+    return waits
 
 
-def table_of_waits(spent: Mapping[str, float]) -> str:
-    """Return the seconds of `first_run`, with the differences that they are measured for, as
-    Markdown.
+def table_of_waits(waits: Mapping[str, Wait]) -> str:
+    """Return what `first_run` has measured as Markdown, with the differences that it is measured
+    for.
 
     Example:
-        >>> waits = {"first run": 60.0, "first run, kernels kept": 35.0, "warm run": 20.0}
-        >>> print(table_of_waits(waits))
-        | | passed, s |
-        |---|---:|
-        | first run | 60.0 |
-        | of it compiling kernels | 25.0 |
-        | of it fitting | 15.0 |
-        | warm run | 20.0 |
+        >>> print(table_of_waits({FIRST: Wait(60, 90), FITTING: Wait(35, 60), WARM: Wait(20, 40)}))
+        | | passed, s | processor, s |
+        |---|---:|---:|
+        | first run | 60.0 | 90.0 |
+        | of it compiling kernels | 25.0 | 30.0 |
+        | of it fitting | 15.0 | 20.0 |
+        | warm run | 20.0 | 40.0 |
     """
-    rows = dict(spent)
-    whole = rows.pop("first run")
-    fitted = rows.pop("first run, kernels kept")
-    warm = rows.pop("warm run")
-    waits = {
-        "install": rows.pop("install", None),
-        "first run": whole,
-        "of it compiling kernels": whole - fitted,
-        "of it fitting": fitted - warm,
-        "warm run": warm,
-        **rows,
-    }
+    others = {name: wait for name, wait in waits.items() if name not in (FIRST, FITTING, WARM)}
+    rows = {name: wait for name, wait in others.items() if name == "install"}
+    rows["first run"] = waits[FIRST]
+    rows["of it compiling kernels"] = waits[FIRST].less(waits[FITTING])
+    rows["of it fitting"] = waits[FITTING].less(waits[WARM])
+    rows["warm run"] = waits[WARM]
     lines = [
-        f"| {name} | {waited_s:.1f} |" for name, waited_s in waits.items() if waited_s is not None
+        f"| {name} | {wait.passed_s:.1f} | {wait.processor_s:.1f} |"
+        for name, wait in (rows | others).items()
     ]
-    return "\n".join(["| | passed, s |", "|---|---:|", *lines])
+    return "\n".join(["| | passed, s | processor, s |", "|---|---:|---:|", *lines])
 
 
 def table(pairs: Sequence[tuple[Costs, Costs]]) -> str:
