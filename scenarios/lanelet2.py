@@ -94,7 +94,7 @@ class Osm:
         path: The file.
 
     Raises:
-        InputError: No OSM file, or one id twice.
+        InputError: No OSM file, one of OpenStreetMap without lanelets, or one id twice.
     """
 
     def __init__(self, files: SourceFiles, path: Path) -> None:
@@ -122,6 +122,12 @@ class Osm:
             if element.tag == "node":
                 places[key] = {**element.attrib, **of_kind[key].tags}
         self.lanelets = self.relations("lanelet")
+        streets = [way for way in self.items["way"].values() if "highway" in way.tags]
+        if streets and not self.lanelets:
+            raise InputError(
+                f"{path}: an OpenStreetMap extract with {len(streets)} ways of streets and paths (tag `highway`) and no lanelet; such a file has no lanes",
+                "make lanes of it first, for example with SUMO's `netconvert --osm-files FILE --opendrive-output MAP.xodr`, and give the OpenDRIVE map",
+            )
         self.rules = self.relations("regulatory_element")
         used = {ref for way in self._used_ways() for ref in self.nodes(way)}
         self.xyz, self.origin, self.notes = self._placed({key: places[key] for key in sorted(used)})

@@ -170,6 +170,17 @@ def test_a_broken_map_is_refused_by_the_name_of_its_element(tmp_path, named):
     assert named == "relation" or named in error.value.message
 
 
+def test_a_plain_file_of_openstreetmap_is_named_as_such(tmp_path):
+    file = tmp_path / "extract.osm"
+    file.write_text(
+        '<osm version="0.6"><node id="1" lat="49.0" lon="8.4"/><node id="2" lat="49.1" lon="8.4"/>'
+        '<way id="10"><nd ref="1"/><nd ref="2"/><tag k="highway" v="residential"/></way></osm>'
+    )
+    with pytest.raises(InputError, match="OpenStreetMap extract with 1 ways") as error:
+        load_scenario(file)
+    assert "--opendrive-output" in error.value.hint
+
+
 def test_entities_are_refused(tmp_path):
     file = written(tmp_path, STREET)
     bomb = '<!DOCTYPE osm [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]>'
