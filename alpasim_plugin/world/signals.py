@@ -9,7 +9,7 @@ import numpy as np
 
 from alpasim_plugin.core.lights_passed import passings
 from alpasim_plugin.core.types import Lane, Signal
-from alpasim_plugin.world.idm import Bodies
+from alpasim_plugin.world.idm import LEVEL_M, Bodies
 from alpasim_plugin.world.path import Path
 
 STOP_BRAKE_MPS2 = 3.0  # who would have to brake harder for a yellow light drives on
@@ -18,6 +18,7 @@ CROSSED_M = 30.0  # behind the line
 CROSSED_S = np.arange(0.0, 4.1, 0.5)  # ahead in time
 LATERAL_M = 2.5  # who comes nearer to the own way is let pass
 MOVING_MPS = 0.5
+SLOPE = 0.1  # a street that leads to the own way may rise or fall by this much a metre
 ALONG = 0.7  # cosine between the own way and those who drive along it ahead, who are followed
 
 
@@ -70,7 +71,8 @@ def give_way_gap_m(
     pass; infinite without one.
 
     Others come if, at the speed that they have, they will be on the way behind the line. Who drives
-    along the own way, before the line or behind it, does not count.
+    along the own way, before the line or behind it, does not count, nor who is on a bridge above it or
+    on a road below.
 
     Args:
         lines: On the path, in its order.
@@ -85,10 +87,13 @@ def give_way_gap_m(
             continue
         crossed, _ = path.at(np.arange(line.s_m + 1.0, line.s_m + CROSSED_M, 1.0))
         s_m, offset_m = path.project(bodies.xy)
-        turned_rad = bodies.yaw - path.at(s_m)[1]
+        beside, way_yaw = path.at(s_m)
+        turned_rad = bodies.yaw - way_yaw
         counts = (np.cos(turned_rad) < ALONG) | (np.abs(offset_m) > LATERAL_M)
         counts &= np.linalg.norm(bodies.velocity, axis=1) > MOVING_MPS
         counts &= np.arange(len(bodies.xy)) != row
+        rise_m = np.abs(bodies.z - beside[:, 2])  # NaN where a height is not known
+        counts &= ~(rise_m > bodies.half_height_m + LEVEL_M + SLOPE * np.abs(offset_m))
         ahead = bodies.velocity[counts, None] * CROSSED_S[:, None]
         places = bodies.xy[counts, None] + ahead  # (K, T, 2)
         apart = places[:, :, None] - crossed[:, :2]  # (K, T, N, 2)

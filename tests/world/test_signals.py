@@ -39,6 +39,18 @@ def test_who_comes_across_the_way_behind_the_line_is_let_pass(body, waits):
     assert gap(*body, front=10.0) == float("inf")  # does not see it yet
 
 
+@pytest.mark.parametrize(
+    ("z_m", "waits"), [(np.nan, True), (0.75, True), (3.0, True), (7.75, False), (-6.0, False)]
+)
+def test_who_is_on_a_bridge_above_or_a_road_below_is_not_let_pass(z_m, waits):
+    """A street that comes from 30 m aside may be 3 m higher there."""
+    east = np.array([10.0, 0.0])
+    comes = bodies_from(np.array([-30.0, 0.0]), np.zeros(1), [BOX], east, np.array([z_m]))
+    lines = lights_on(NORTH, [LINE], {})
+    met = give_way_gap_m(lines, NORTH, 30.0, comes, -1)
+    assert met == (pytest.approx(14.0) if waits else float("inf"))
+
+
 def test_a_driver_slows_down_before_a_bend_and_creeps_around_a_corner():
     angle = np.linspace(0.0, np.pi / 2, 20)
     arc = np.column_stack([60.0 + 12.0 * np.sin(angle), 12.0 - 12.0 * np.cos(angle), 0.0 * angle])
