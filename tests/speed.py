@@ -85,14 +85,16 @@ print(json.dumps(costs))
 """
 # A whole warm command, in one process so that all of its processor time is counted.
 JOB = """
-import json, resource, subprocess, sys, tempfile
+import json, pathlib, resource, subprocess, sys, tempfile
 names = ",".join(sys.argv[1:])
 command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", names]
 command += ["--policy", "lane-camera", "--workers", "1", "smoke/curve", "--out"]
 with tempfile.TemporaryDirectory() as folder:
     done = subprocess.run([*command, folder + "/run"], capture_output=True, text=True)
-if done.returncode not in (0, 1):
-    sys.exit(done.stderr)
+    manifests = pathlib.Path(folder, "run", "rollouts").rglob("manifest.json")
+    whole = [json.loads(path.read_text())["status"] for path in manifests].count("ok")
+if done.returncode not in (0, 1) or whole < len(sys.argv) - 1:
+    sys.exit(f"{whole} rollouts are whole: {done.stderr}")
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(json.dumps({"main job": 1e3 * (used.ru_utime + used.ru_stime)}))
 """
