@@ -35,7 +35,6 @@ NOTES = {
     "alpasim.client": "remote renderers, drivers",
     "evaluators": "metrics, statistics, pages",
 }
-LOWEST = ("cameras", "world", "policies", "control", "log")  # from left to right
 BOX_WIDTH, BOX_HEIGHT = 190, 46
 GAP_X, GAP_Y = 14, 58
 MARGIN = 20
@@ -104,14 +103,14 @@ def in_rows(imported: Mapping[str, set[str]]) -> list[list[str]]:
     rooms that it imports stand on average, so that few arrows cross.
     """
     depth = depths(imported)
-    place = {name: (rank + 0.5) / len(LOWEST) for rank, name in enumerate(LOWEST)}
-    rows = [list(LOWEST)]
+    lowest = [name for name in depth if depth[name] == 0]
+    place = {name: (rank + 0.5) / len(lowest) for rank, name in enumerate(lowest)}
+    rows = [lowest]
     for level in range(1, max(depth.values()) + 1):
         names = [name for name in depth if depth[name] == level]
         names.sort(key=lambda name: np.mean([place[other] for other in imported[name]]))
         place |= {name: (rank + 0.5) / len(names) for rank, name in enumerate(names)}
         rows.append(names)
-    assert set(LOWEST) == {name for name in depth if depth[name] == 0}
     return rows
 
 
