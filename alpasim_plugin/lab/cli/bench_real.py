@@ -24,7 +24,7 @@ from alpasim_plugin.core.printing import say_document
 from alpasim_plugin.core.types import U8, CameraSpec, Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
-from alpasim_plugin.lab.bench.open_loop import TrueImage, sensors_of
+from alpasim_plugin.lab.bench.open_loop import TrueImage, roles_of, sensors_of
 from alpasim_plugin.lab.bench.plan_gap import gap_intervals, gap_rows
 from alpasim_plugin.lab.bench.real import (
     Judges,
@@ -120,8 +120,10 @@ def real(
     offsets_m = _offsets(offsets)
     _refuse_mixtures(scenarios, built, bench.policies, offsets)
     recorded = {name: drive for name, drive in scenarios.items() if name not in built}
+    # What cannot be measured is refused before anything is rendered.
     for scenario in recorded.values():
-        unseen_cameras(scenario)  # what cannot be measured is refused before anything is rendered
+        unseen_cameras(scenario)
+    bench.check_policies(recorded, built)
     images: list[Row] = []
     gaps: list[dict[str, Any]] = []
     if recorded:
@@ -145,6 +147,21 @@ class _Bench:
     device: str
     threads: int | None
     console: Console
+
+    def check_policies(
+        self, recorded: Mapping[str, Scenario], built: Mapping[str, Scenario]
+    ) -> None:
+        """Build every policy for every drive.
+
+        Raises:
+            InputError: A policy cannot be asked there.
+            PolicyError: A policy raised.
+        """
+        for policy in self.policies:
+            for scenario in recorded.values():
+                roles_of(policy, scenario, series_of(shots_of(scenario)))
+            for scenario in built.values():
+                _cameras_of(policy, scenario)
 
     def measure(
         self, name: str, scenario: Scenario, judges: Judges

@@ -288,6 +288,16 @@ def test_the_command_prints_both_kinds_of_rows(drive, monkeypatch, capsys):
         assert run_command(["bench", "real", "d", "--renderer", "3dgs", *arguments]) == 2
 
 
+def test_a_policy_that_cannot_be_asked_is_refused_before_anything_is_rendered(
+    drive, monkeypatch, capsys
+):
+    monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
+    monkeypatch.setattr(bench_real, "_judges", lambda console: pytest.fail("it goes on"))
+    policies = f"{HERE}:Steers,learned-three"
+    assert run_command(["bench", "real", "d", "--renderer", "3dgs", "--policy", policies]) == 2
+    assert "no pinhole for the view 'left'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("offsets", ["a", "0,0", "11", "nan", ","])
 def test_offsets_that_are_none_are_refused(offsets, capsys):
     command = [
