@@ -8,8 +8,9 @@ Mahalanobis distance is ``q^2 = (a^2 + b^2) / (c^2 + (a^2 + b^2) / o^2)`` with a
 distance |w x L^-1 d|^2 / |L^-1 d|^2 of Wu et al., 3DGUT (2025), without its cancellation. Where c is
 negative the peak lies behind the centre, and c is taken as 0: what is left is o^2, the value at the centre.
 
-A ray that starts at another place o(t) has the moment m = o(t) x d, and the numerator becomes |(b + N1 m,
-N2 m - a, N3 m)|^2 with N_i = (n / o) det(L^-1) L q_i.
+A ray that starts at another place s has, with s1, s2, s3 the parts of L^-1 s along q1, q2, w, the last
+over o, the numerator ``|(b + s2 c - s3 b, a + s1 c - s3 a, (s1 b - s2 a) / o)|^2``: what moves evenly
+while a shutter is open needs three numbers more.
 """
 
 # Numba's decorators and vector types are untyped.
@@ -66,8 +67,8 @@ from alpasim_plugin.gaussians.raster.raster_kernels import CUT
 # A record: columns 6 to 8 are the colour; from 16 on for rolling shutters alone.
 ROW_A, ROW_B, ROW_C = 0, 3, 9
 INVERSE_O2, PEAK, DEPTH, CUT_SIGMA = 12, 13, 14, 15
-ROW_N = 16
-NODE, DISTANCE = 25, 26  # the place of its motion, -1: it stands in the world; n
+ROW_S = 16  # s1, s2, s3 of the motion in a whole shutter
+NODE, DISTANCE = 25, 26  # the place of its motion, -1: it does not turn; n
 PASSED = 27  # 1: the camera may pass it, or be in it, while the shutter is open
 SHORT, LONG = 16, 32  # numbers of a record
 # further columns of the lanes in which sixteen records are made
@@ -81,6 +82,7 @@ CLOSE = 0.95  # of (t / o)^2: the camera lies within the drawn ellipsoid, or nea
 WIDE = 0.2  # of (half axis / distance)^2: the outline is too wide for eight directions
 LEAST_SLOPE = 0.05  # of the pixels per radian along the radius to those across
 NEAR_SHIFTS = 1.5  # nearer than so many shifts of a shutter a Gaussian is looked for everywhere
+LATE = 0.75
 EVERY = 1.0e9
 
 
@@ -388,12 +390,13 @@ def _write_box(lanes, lens, place, n, first, second, moves):
     more_w = bend_w + lens[LENS_MARGIN]
     everywhere = v.bits(s >= lens[LENS_S_MOST])
     if lens[LENS_ROLLS] > 0:
-        # What the time at the box's ends moves it by, and what coming nearer changes of its size.
-        parallax = v.to_f32(0.5 * moves[1] / n)
+        # What the time at the box's ends, half its size away, moves it by, and half as much more for
+        # what comes nearer meanwhile.
+        shift_rad = v.to_f32(moves[1] / n)
         rate = abs(lens[LENS_TIME]) * (right - left) + abs(lens[LENS_TIME + 1]) * (bottom - top)
-        late = rate * (2.0 * parallax + moves[0]) * (2.0 * lens[LENS_MOST])
-        more_u = more_u + late + 1.5 * parallax * (right - left) + 0.1
-        more_w = more_w + late + 1.5 * parallax * (bottom - top) + 0.1
+        late = rate * (shift_rad + moves[0]) * (LATE * lens[LENS_MOST])
+        more_u = more_u + late + 0.1
+        more_w = more_w + late + 0.1
         everywhere |= v.bits(n < NEAR_SHIFTS * moves[1])
     left, right, top, bottom = left - more_u, right + more_u, top - more_w, bottom + more_w
     v.store(lanes, LEFT * 16, left)
@@ -429,7 +432,7 @@ def _size(geometry, geo):
 
 
 @kernel
-def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves):
+def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, moved):
     """Write the rows and boxes of Gaussians; returns the bits of those that reach the image."""
     antialias = pose[POSE_ANTIALIAS]
     eps = antialias if antialias > 0 else EPS2D_PX2
@@ -476,10 +479,9 @@ def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves):
     v.store(lanes, DEPTH * 16, v.to_f32(at_n))
     v.store(lanes, CUT_SIGMA * 16, v.to_f32(t))
     if lens[LENS_ROLLS] > 0:
-        scale = n * inverse_o * inverses[0] * inverses[1] * inverses[2]
-        _store3(lanes, ROW_N, _scaled(first, scale))
-        _store3(lanes, ROW_N + 3, _scaled(second, scale))
-        _store3(lanes, ROW_N + 6, _scaled(p, scale * inverse_o))
+        zero = n * 0.0
+        s = _solved(lower, inverses, (zero + moved[0], zero + moved[1], zero + moved[2]))
+        _store3(lanes, ROW_S, (dot(s, q1), dot(s, q2), dot(s, w) * inverse_o))
         v.store(lanes, DISTANCE * 16, v.to_f32(n))
     return chosen
 
@@ -517,7 +519,7 @@ def _list_everywhere(lanes, everywhere):
 
 
 @kernel
-def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, lanes):
+def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, moved, lanes):
     """Project sixteen Gaussians into ``lanes`` and return the bit mask of those that reach the
     image.
     """
@@ -540,7 +542,7 @@ def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, lanes
     place = p
     if lens[LENS_ROLLS] > 0:
         place = _at_its_time(p, pose, lens)
-    chosen = _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves)
+    chosen = _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, moved)
     if chosen != 0:
         largest = v.maximum(v.maximum(v.absolute(p[0]), v.absolute(p[1])), v.absolute(p[2]))
         v.store(lanes, KEY * 16, v.to_f32(largest))
@@ -556,6 +558,28 @@ def _tile_number(place, n_tiles):
 
 
 @kernel
+def _count(bits):
+    count = 0
+    while bits != 0:
+        bits &= bits - 1
+        count += 1
+    return count
+
+
+@kernel
+def _write_record(lanes, lane, lens, out, size, records, boxes):
+    """Write the record and the tiles of the box of a lane's Gaussian."""
+    for column in range(size):
+        records[out * size + column] = lanes[column * 16 + lane]
+    tiles_x = -(-int(lens[LENS_WIDTH]) // TILE)
+    tiles_y = -(-int(lens[LENS_HEIGHT]) // TILE)
+    boxes[out, 0] = _tile_number(lanes[LEFT * 16 + lane] - 0.5, tiles_x)
+    boxes[out, 1] = _tile_number(lanes[RIGHT * 16 + lane] - 0.5 + TILE, tiles_x)
+    boxes[out, 2] = _tile_number(lanes[TOP * 16 + lane] - 0.5, tiles_y)
+    boxes[out, 3] = _tile_number(lanes[BOTTOM * 16 + lane] - 0.5 + TILE, tiles_y)
+
+
+@kernel
 def project_lens_part(
     cursor,
     part,
@@ -567,6 +591,7 @@ def project_lens_part(
     first_id,
     pose,
     node,
+    moved,
     lens,
     size,
     records,
@@ -580,7 +605,8 @@ def project_lens_part(
     Args:
         cursor, part, means, geometry, sh, sh_size, index, first_id, pose: See
             `project_kernels.project_part`.
-        node: Place of the part's motion, -1: it stands in the world.
+        node: Place of the part's motion, -1: it does not turn in the world.
+        moved: float64 ``(3,)``, by how much the camera moves in a shutter as the part sees it.
         lens: float64 ``(LENS_SIZE,)``.
         size: Numbers of a record.
         records: float32 output, ``size`` per splat.
@@ -596,8 +622,6 @@ def project_lens_part(
         np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2),
         np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2),
     )
-    tiles_x = -(-int(lens[LENS_WIDTH]) // TILE)
-    tiles_y = -(-int(lens[LENS_HEIGHT]) // TILE)
     groups = index.shape[0] // 16
     for lane in range(16):
         lanes[NODE * 16 + lane] = node
@@ -606,24 +630,16 @@ def project_lens_part(
         if begin >= groups:
             return
         for group in range(begin, min(begin + CHUNK, groups)):
-            chosen = _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, lanes)
+            chosen = _project_group(
+                group, means, geometry, sh, sh_size, pose, lens, moves, row(moved, 0), lanes
+            )
             if chosen == 0:
                 continue
-            count = 0
-            remaining = chosen
-            while remaining != 0:
-                remaining &= remaining - 1
-                count += 1
-            out = v.fetch_add(cursor, 0, count)
+            out = v.fetch_add(cursor, 0, _count(chosen))
             while chosen != 0:
                 lane = v.lowest_bit(chosen)
                 chosen &= chosen - 1
-                for column in range(size):
-                    records[out * size + column] = lanes[column * 16 + lane]
-                boxes[out, 0] = _tile_number(lanes[LEFT * 16 + lane] - 0.5, tiles_x)
-                boxes[out, 1] = _tile_number(lanes[RIGHT * 16 + lane] - 0.5 + TILE, tiles_x)
-                boxes[out, 2] = _tile_number(lanes[TOP * 16 + lane] - 0.5, tiles_y)
-                boxes[out, 3] = _tile_number(lanes[BOTTOM * 16 + lane] - 0.5 + TILE, tiles_y)
+                _write_record(lanes, lane, lens, out, size, records, boxes)
                 keys[out] = lanes[KEY * 16 + lane]
                 ids[out] = index[group * 16 + lane] + first_id
                 out += 1

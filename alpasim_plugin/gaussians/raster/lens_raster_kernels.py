@@ -35,7 +35,7 @@ from alpasim_plugin.gaussians.raster.lens_project_kernels import (
     ROW_A,
     ROW_B,
     ROW_C,
-    ROW_N,
+    ROW_S,
     SHORT,
 )
 from alpasim_plugin.gaussians.raster.lens_rays import (
@@ -45,7 +45,7 @@ from alpasim_plugin.gaussians.raster.lens_rays import (
     LENS_TURN,
     MOTION,
     MOTION_BOUND_D,
-    MOTION_BOUND_M,
+    MOTION_BOUND_O,
     MOTION_CENTRE,
     MOTION_SPEED,
     MOTION_TURN,
@@ -67,10 +67,11 @@ from alpasim_plugin.gaussians.raster.raster_kernels import (
 _f = np.float32
 Q2_SCALE = _f(EXPONENT_SCALE**2)
 TINY = _f(1e-30)
-# Per block of a rolling shutter's tile: direction, moment and time of sixteen pixels.
-ROLLED_D, ROLLED_M, ROLLED_TIME, ROLLED = 0, 48, 96, 112
-# Per tile: mean, change to the right and down of directions and moments, then what they miss.
-BLOCKS_M, MISSED_D, MISSED_M, BLOCKS = 144, 288, 304, 320
+# Per block of a rolling shutter's tile: direction and time of sixteen pixels.
+ROLLED_D, ROLLED_TIME, ROLLED = 0, 48, 64
+# Per tile: mean, change to the right and down of directions, what they miss, and the blocks' times.
+MISSED_D, BLOCK_TIME, BLOCKS = 144, 160, 176
+HALF_BLOCK_PX = _f(1.5)
 ALL_BLOCKS = 0xFFFF
 ROUNDING = _f(1e-3)  # of standard deviations
 
@@ -96,11 +97,6 @@ def _time(lens, x, y):
 
 
 @kernel
-def _times(a, k):
-    return a[0] * k, a[1] * k, a[2] * k
-
-
-@kernel
 def _store3(array, offset, a):
     v.store(array, offset, a[0])
     v.store(array, offset + 16, a[1])
@@ -109,29 +105,25 @@ def _store3(array, offset, a):
 
 @kernel
 def _roll_pixels(rays, place, x, y, lens, rolled, block):
-    """Write direction, moment and time of a block's pixels."""
+    """Write direction and time of a block's pixels."""
     time = _time(lens, x, y)
-    turn = row(lens, LENS_TURN)
-    shift = row(lens, LENS_SHIFT)
-    d = _turned(load3(rays, place), turn, time)
+    d = _turned(load3(rays, place), row(lens, LENS_TURN), time)
     base = block * ROLLED
     _store3(rolled, base + ROLLED_D, d)
-    _store3(rolled, base + ROLLED_M, _times(cross(shift, d), time))
     v.store(rolled, base + ROLLED_TIME, time)
 
 
 @kernel
 def _roll_blocks(blocks, place, x0, y0, lens, out):
-    """Write how directions and moments vary over a tile's blocks; ``x0, y0`` is the centre of its
-    first pixel.
+    """Write how directions vary over a tile's blocks, and their times; ``x0, y0`` is the centre of
+    its first pixel.
     """
     turn = row(lens, LENS_TURN)
-    shift = row(lens, LENS_SHIFT)
     mean, right, down = load3(blocks, place), load3(blocks, place + 48), load3(blocks, place + 96)
     x = v.lane_pattern(_f(4.0), _f(0.0)) + x0
     y = v.lane_pattern(_f(0.0), _f(4.0)) + y0
     zero = x * _f(0.0)
-    for k in range(18):
+    for k in range(9):
         v.store(out, k * 16, zero)
     quarter = _f(0.25)
     for corner in range(4):
@@ -144,22 +136,23 @@ def _roll_blocks(blocks, place, x0, y0, lens, out):
         )
         time = _time(lens, x + (to_right + _f(1.0)) * _f(1.5), y + (to_down + _f(1.0)) * _f(1.5))
         d = _turned(d, turn, time)
-        m = _times(cross(shift, d), time)
         for k in range(3):
-            for first, value in ((k * 16, d[k]), (BLOCKS_M + k * 16, m[k])):
-                v.store(out, first, v.fma(quarter, value, v.load(out, first)))
-                change = v.fma(quarter * to_right, value, v.load(out, first + 48))
-                v.store(out, first + 48, change)
-                change = v.fma(quarter * to_down, value, v.load(out, first + 96))
-                v.store(out, first + 96, change)
+            first = k * 16
+            v.store(out, first, v.fma(quarter, d[k], v.load(out, first)))
+            v.store(out, first + 48, v.fma(quarter * to_right, d[k], v.load(out, first + 48)))
+            v.store(out, first + 96, v.fma(quarter * to_down, d[k], v.load(out, first + 96)))
     # What a product of the time's and the ray's change adds.
-    later = _f(3.0 * (abs(lens[LENS_TIME]) + abs(lens[LENS_TIME + 1])))
+    later = _f(2.0) * _half_block_time(lens)
     turned = later * _f(np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2))
-    moved = _f(np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2))
     change = v.sqrt(dot(right, right)) + v.sqrt(dot(down, down))
-    missed = v.load(blocks, place + 144) + turned * (change + turned)
-    v.store(out, MISSED_D, missed)
-    v.store(out, MISSED_M, moved * (_f(0.5) * missed + later * (change + turned)))
+    v.store(out, MISSED_D, v.load(blocks, place + 144) + turned * (change + turned))
+    v.store(out, BLOCK_TIME, _time(lens, x + HALF_BLOCK_PX, y + HALF_BLOCK_PX))
+
+
+@kernel
+def _half_block_time(lens):
+    """Return by how much a pixel of a block is exposed before or after its middle, at most."""
+    return HALF_BLOCK_PX * _f(abs(lens[LENS_TIME]) + abs(lens[LENS_TIME + 1]))
 
 
 @kernel
@@ -184,7 +177,7 @@ def _length(records, first, end):
 
 
 @kernel
-def _touched(records, place, blocks, offset, motion):
+def _touched(records, place, blocks, offset, motion, later):
     """Return the bit mask of a tile's blocks that a Gaussian can touch."""
     t2 = records[place + CUT_SIGMA] * records[place + CUT_SIGMA]
     if records[place + INVERSE_O2] * t2 >= _f(CLOSE):
@@ -210,18 +203,29 @@ def _touched(records, place, blocks, offset, motion):
     most = off_axis + change
     ahead = c + v.absolute(c_right) + v.absolute(c_down) + extra
     if motion is not None:
-        n1, n1_right, n1_down = _vary(records, place + ROW_N, blocks, offset + BLOCKS_M)
-        n2, n2_right, n2_down = _vary(records, place + ROW_N + 3, blocks, offset + BLOCKS_M)
-        x = b + n1
-        y = n2 - a
+        s1, s2, s3 = row(records, place + ROW_S)
+        time = v.load(blocks, offset + BLOCK_TIME)
+        by_x = v.fma(s2, c, v.negative(s3 * b))
+        by_y = v.fma(s3, a, v.negative(s1 * c))
+        x = v.fma(time, by_x, b)
+        y = v.fma(time, by_y, v.negative(a))
         off_axis = v.sqrt(v.fma(x, x, y * y))
-        change_x = v.absolute(b_right + n1_right) + v.absolute(b_down + n1_down)
-        change_y = v.absolute(n2_right - a_right) + v.absolute(n2_down - a_down)
-        missed_m = v.load(blocks, offset + MISSED_M)
+        x_right = v.fma(s2, c_right, v.negative(s3 * b_right))
+        x_down = v.fma(s2, c_down, v.negative(s3 * b_down))
+        y_right = v.fma(s3, a_right, v.negative(s1 * c_right))
+        y_down = v.fma(s3, a_down, v.negative(s1 * c_down))
+        change_x = v.absolute(v.fma(time, x_right, b_right))
+        change_x = change_x + v.absolute(v.fma(time, x_down, b_down))
+        change_x = change_x + later * (v.absolute(by_x) + v.absolute(x_right) + v.absolute(x_down))
+        change_y = v.absolute(v.fma(time, y_right, v.negative(a_right)))
+        change_y = change_y + v.absolute(v.fma(time, y_down, v.negative(a_down)))
+        change_y = change_y + later * (v.absolute(by_y) + v.absolute(y_right) + v.absolute(y_down))
+        sway = _f(1.0) + _f(0.5) * (abs(s1) + abs(s2) + abs(s3))
+        change = v.sqrt(v.fma(change_x, change_x, change_y * change_y)) + extra * sway
         if records[place + NODE] >= 0:
-            missed_m = missed_m + motion[np.int64(records[place + NODE]) * MOTION + MOTION_BOUND_M]
-        change = v.sqrt(v.fma(change_x, change_x, change_y * change_y)) + extra
-        change = change + _length(records, place + ROW_N, place + ROW_N + 6) * missed_m
+            node = np.int64(records[place + NODE]) * MOTION
+            off = size * motion[node + MOTION_BOUND_O] / records[place + DISTANCE]
+            change = change + off * (v.absolute(ahead) + most)
     least = v.maximum(off_axis - change, _f(0.0))
     below = v.fma(most * most, records[place + INVERSE_O2], ahead * ahead)
     return v.bits((least * least <= _f(1.0001) * t2 * below) & (ahead > _f(0.0)))
@@ -247,39 +251,62 @@ def _as_if_still(motion, node, d, o, time):
 
 
 @kernel
-def _from_start(near, place, a, b, c, o):
-    """Return for rays that start at ``o``, of a Gaussian near by, how far ahead of it the peak lies,
-    in no unit, and q^2 there.
+def _from_start(inverse_o2, s, a, b, c):
+    """Return for rays whose starts are moved by ``s``, of a Gaussian near by, how far ahead of it the
+    peak lies, in no unit, and q^2 there.
     """
-    inverse_n = _f(1.0) / near[place + DISTANCE]
-    middle = _f(1.0) / np.sqrt(near[place + INVERSE_O2])
-    x = dot(row(near, place + ROW_A), o) * inverse_n
-    y = dot(row(near, place + ROW_B), o) * inverse_n
-    z = v.fnma(dot(row(near, place + ROW_C), o), middle * inverse_n, middle)
-    ahead = v.fnma(x, a, v.fnma(y, b, z * (c * middle)))
-    return ahead, v.fma(x, x, v.fma(y, y, z * z))
+    middle = _f(1.0) / np.sqrt(inverse_o2)
+    z = v.fnma(s[2], middle, middle)
+    ahead = v.fnma(s[0], a, v.fnma(s[1], b, z * (c * middle)))
+    return ahead, v.fma(s[0], s[0], v.fma(s[1], s[1], z * z))
 
 
 @kernel
-def _rolled_q2(near, place, d, m, time, shift, motion):
-    """Return q^2 on the rays of a rolling shutter."""
-    o = time * shift[0], time * shift[1], time * shift[2]
-    if near[place + NODE] >= 0:
-        d, o = _as_if_still(motion, np.int64(near[place + NODE]) * MOTION, d, o, time)
-        m = cross(o, d)
+def _moved_q2(near, place, d, s):
+    """Return q^2 on rays whose starts are moved by ``s``, see `lens_project_kernels`; its parts a, b, c
+    as well, and what is below the fraction but for c^2.
+    """
     a = dot(row(near, place + ROW_A), d)
     b = dot(row(near, place + ROW_B), d)
     c = dot(row(near, place + ROW_C), d)
-    x = b + dot(row(near, place + ROW_N), m)
-    y = dot(row(near, place + ROW_N + 3), m) - a
-    z = dot(row(near, place + ROW_N + 6), m)
-    top = v.fma(x, x, v.fma(y, y, z * z))
-    across = v.maximum(v.fma(a, a, b * b), TINY) * near[place + INVERSE_O2]
+    inverse_o2 = near[place + INVERSE_O2]
+    x = v.fma(s[1], c, v.fnma(s[2], b, b))
+    y = v.fma(s[0], c, v.fnma(s[2], a, a))
+    z = v.fma(s[0], b, v.negative(s[1] * a))
+    top = v.fma(x, x, v.fma(y, y, inverse_o2 * (z * z)))
+    across = v.maximum(v.fma(a, a, b * b), TINY) * inverse_o2
+    ahead = v.maximum(c, _f(0.0))
+    return top / v.fma(ahead, ahead, across), (a, b, c), top, across
+
+
+@kernel
+def _even_q2(near, place, d, time):
+    """Return q^2 on the rays of a rolling shutter of what moves evenly, and is not passed."""
+    s1, s2, s3 = row(near, place + ROW_S)
+    q2, _, _, _ = _moved_q2(near, place, d, (time * s1, time * s2, time * s3))
+    return q2
+
+
+@kernel
+def _turned_q2(near, place, d, time, shift, motion):
+    """Return q^2 on the rays of a rolling shutter of anything."""
+    if near[place + NODE] >= 0:
+        o = time * shift[0], time * shift[1], time * shift[2]
+        d, o = _as_if_still(motion, np.int64(near[place + NODE]) * MOTION, d, o, time)
+        inverse_n = _f(1.0) / near[place + DISTANCE]
+        s = (
+            dot(row(near, place + ROW_A), o) * inverse_n,
+            dot(row(near, place + ROW_B), o) * inverse_n,
+            dot(row(near, place + ROW_C), o) * inverse_n,
+        )
+    else:
+        s1, s2, s3 = row(near, place + ROW_S)
+        s = time * s1, time * s2, time * s3
+    q2, (a, b, c), top, across = _moved_q2(near, place, d, s)
     if near[place + PASSED] > 0:
-        ahead, start = _from_start(near, place, a, b, c, o)
-        return v.select(ahead > _f(0.0), top / v.fma(c, c, across), start)
-    c = v.maximum(c, _f(0.0))
-    return top / v.fma(c, c, across)
+        ahead, start = _from_start(near[place + INVERSE_O2], s, a, b, c)
+        q2 = v.select(ahead > _f(0.0), top / v.fma(c, c, across), start)
+    return q2
 
 
 @kernel
@@ -293,17 +320,21 @@ def _q2(near, place, d):
 
 
 @kernel
-def _blend_block(block, rays, at_rays, rolled, lens, motion, masks, near, size, state):
-    """Blend the splats of a chunk that touch a block; returns whether its pixels are finished."""
+def _blend_block(block, rays, at_rays, rolled, lens, motion, chunk):
+    """Blend the splats of a chunk that touch a block; returns whether its pixels are finished.
+
+    ``rolled`` is None of a global shutter, ``motion`` where all that is near moves evenly: a branch
+    for each splat would cost as much as the splat.
+    """
+    masks, near, size, state = chunk
     base = block * STATE
     through = v.load(state, base + STATE_T)
     red = v.load(state, base + STATE_R)
     green = v.load(state, base + STATE_G)
     blue = v.load(state, base + STATE_B)
     depth = v.load(state, base + STATE_D)
-    if motion is not None:
+    if rolled is not None:
         d = load3(rolled, block * ROLLED + ROLLED_D)
-        m = load3(rolled, block * ROLLED + ROLLED_M)
         time = v.load(rolled, block * ROLLED + ROLLED_TIME)
         shift = row(lens, LENS_SHIFT)
     else:
@@ -319,7 +350,9 @@ def _blend_block(block, rays, at_rays, rolled, lens, motion, masks, near, size, 
             place = (word * 64 + v.lowest_bit(touching)) * size
             touching &= touching - 1
             if motion is not None:
-                q2 = _rolled_q2(near, place, d, m, time, shift, motion)
+                q2 = _turned_q2(near, place, d, time, shift, motion)
+            elif rolled is not None:
+                q2 = _even_q2(near, place, d, time)
             else:
                 q2 = _q2(near, place, d)
             exponent = v.fnma(q2, Q2_SCALE, near[place + PEAK])
@@ -373,18 +406,24 @@ def _composite_tile(
     """
     state, near, masks = room
     size = LONG if motion is not None else SHORT
+    later = _half_block_time(lens)
     for first in range(start, end, CHUNK):
         if live == 0:
             return
         count = min(CHUNK, end - first)
+        is_even = True
         for i in range(count):
-            v.prefetch(records, np.int64(lists[min(first + i + 16, end - 1)]) * size)
+            later_place = np.int64(lists[min(first + i + 16, end - 1)]) * size
+            v.prefetch(records, later_place)
+            if motion is not None:
+                v.prefetch(records, later_place + 16)
             place = np.int64(lists[first + i]) * size
-            masks[i] = _touched(records, place, blocks, at_blocks, motion)
+            masks[i] = _touched(records, place, blocks, at_blocks, motion, later)
             if masks[i] & live:
                 v.store(near, i * size, v.load(records, place))
                 if motion is not None:
                     v.store(near, i * size + 16, v.load(records, place + 16))
+                    is_even &= (records[place + NODE] < 0) & (records[place + PASSED] <= 0)
         for i in range(count, CHUNK):
             masks[i] = 0
         todo = live
@@ -392,7 +431,14 @@ def _composite_tile(
             block = v.lowest_bit(todo)
             todo &= todo - 1
             place = at_rays + block * 48
-            if _blend_block(block, rays, place, rolled, lens, motion, masks, near, size, state):
+            chunk = masks, near, size, state
+            if motion is None:
+                finished = _blend_block(block, rays, place, None, lens, None, chunk)
+            elif is_even:
+                finished = _blend_block(block, rays, place, rolled, lens, None, chunk)
+            else:
+                finished = _blend_block(block, rays, place, rolled, lens, motion, chunk)
+            if finished:
                 live &= ~(1 << block)
 
 

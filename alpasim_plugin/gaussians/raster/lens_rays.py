@@ -42,8 +42,8 @@ BLOCK_ROWS = 10
 STEPS = np.linspace(-1, 1, 4, dtype=np.float32)
 MARGIN_PX = 0.02
 # How a moving node differs from the standing world: rotation vector, velocity and centre, by the
-# shutter, then how much this changes a ray's direction and moment at most.
-MOTION_TURN, MOTION_SPEED, MOTION_CENTRE, MOTION_BOUND_D, MOTION_BOUND_M = 0, 3, 6, 9, 10
+# shutter, then how much its turning changes a ray's direction and start at most.
+MOTION_TURN, MOTION_SPEED, MOTION_CENTRE, MOTION_BOUND_D, MOTION_BOUND_O = 0, 3, 6, 9, 10
 MOTION = 11
 
 
@@ -159,7 +159,5 @@ def node_motion(
     speed = 2 * (centre - before[:3, 3])
     camera_half = float(np.linalg.norm((T @ inverse(rolling.T_camera_world_start))[:3, 3]))
     bound = 0.51 * float(np.linalg.norm(turn))
-    moved = 0.51 * float(np.linalg.norm(speed)) + bound * (
-        float(np.linalg.norm(centre)) + camera_half + 1.0
-    )
-    return np.array([*turn, *speed, *centre, bound, moved + bound * camera_half], dtype=np.float32)
+    moved = bound * (float(np.linalg.norm(centre)) + camera_half + 1.0)
+    return np.array([*turn, *speed, *centre, bound, moved], dtype=np.float32)

@@ -17,7 +17,15 @@ from alpasim_plugin.gaussians.constants import POSE_ANTIALIAS, POSE_SHIFT, POSE_
 from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.raster.lens_project_kernels import LONG, SHORT, project_lens_part
 from alpasim_plugin.gaussians.raster.lens_raster_kernels import composite_lens_tiles
-from alpasim_plugin.gaussians.raster.lens_rays import MOTION, camera_lens, node_motion, tile_rays
+from alpasim_plugin.gaussians.raster.lens_rays import (
+    LENS_SHIFT,
+    MOTION,
+    MOTION_SPEED,
+    MOTION_TURN,
+    camera_lens,
+    node_motion,
+    tile_rays,
+)
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node
 from alpasim_plugin.gaussians.raster.stages import (
@@ -28,6 +36,8 @@ from alpasim_plugin.gaussians.raster.stages import (
     run_on_threads,
     write_motion,
 )
+
+STRAIGHT_RAD = 1e-5  # a road user that turns less in a shutter moves along a line
 
 
 def rasterize_lens(
@@ -50,7 +60,7 @@ def rasterize_lens(
     table_of_rays = tile_rays(camera)
     poses = node_poses([T for _, T in nodes], camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
-    numbers, motion = _motions(nodes, starts, camera, poses)
+    numbers, moved, motion = _motions(nodes, starts, camera, poses, lens)
     size = SHORT if motion is None else LONG
     room = sum(len(prepared.index) for prepared, _ in nodes)
     records = np.empty(room * size, dtype=np.float32)
@@ -59,8 +69,10 @@ def rasterize_lens(
     ids = np.empty(room, dtype=np.int64)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts = [
-        (*prepared.arrays(), end - prepared.n_input, pose, number, lens, size)
-        for (prepared, _), end, pose, number in zip(nodes, ends, poses, numbers, strict=True)
+        (*prepared.arrays(), end - prepared.n_input, pose, number, shift, lens, size)
+        for (prepared, _), end, pose, number, shift in zip(
+            nodes, ends, poses, numbers, moved, strict=True
+        )
     ]
     cursor = np.zeros(len(parts) + 1, dtype=np.int64)
 
@@ -85,24 +97,31 @@ def rasterize_lens(
 
 
 def _motions(
-    nodes: Sequence[Node], starts: Sequence[F64 | None], camera: LensCamera, poses: F64
-) -> tuple[list[int], F32 | None]:
+    nodes: Sequence[Node], starts: Sequence[F64 | None], camera: LensCamera, poses: F64, lens: F64
+) -> tuple[list[int], list[F64], F32 | None]:
     """Write into the numbers of the nodes' poses how each moves as the camera sees it; return the
-    place of each node's own motion in the world, -1 where it stands, and these motions; None of a
-    global shutter.
+    place of each node's own motion in the world, -1 where it does not turn, by how much the camera
+    moves as each sees it ``(3,)``, and the motions of those that turn; None of a global shutter.
     """
     rolling = camera.rolling
+    camera_shift = lens[LENS_SHIFT : LENS_SHIFT + 3].copy()
     if rolling is None:
         poses[:, POSE_TURN : POSE_SHIFT + 3] = 0.0
-        return [-1] * len(nodes), None
+        return [-1] * len(nodes), [camera_shift] * len(nodes), None
     write_motion(poses, nodes, starts or [None] * len(nodes), camera)
     numbers: list[int] = []
+    moved: list[F64] = []
     motions: list[F32] = []
     for (_, T), start in zip(nodes, starts or [None] * len(nodes), strict=True):
-        if T is None or start is None or np.array_equal(T, start):
-            numbers.append(-1)
-        else:
-            numbers.append(len(motions))
-            motions.append(node_motion(camera, rolling, np.asarray(T, dtype=np.float64), start))
+        number = -1
+        shift = camera_shift
+        if T is not None and start is not None:
+            motion = node_motion(camera, rolling, np.asarray(T, dtype=np.float64), start)
+            shift = camera_shift - motion[MOTION_SPEED : MOTION_SPEED + 3]
+            if np.linalg.norm(motion[MOTION_TURN : MOTION_TURN + 3]) > STRAIGHT_RAD:
+                number = len(motions)
+                motions.append(motion)
+        numbers.append(number)
+        moved.append(shift)
     table = np.concatenate(motions) if motions else np.zeros(MOTION, dtype=np.float32)
-    return numbers, table
+    return numbers, moved, table
