@@ -30,12 +30,14 @@ from alpasim_plugin.lab.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import CONTENT, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
 from alpasim_plugin.lab.video_metrics.clip import clip_quality
+from alpasim_plugin.lab.video_metrics.detectors import available_detectors, intrinsics_of
 from alpasim_plugin.lab.video_metrics.image_distance import (
     ImageDistance,
     available,
     digests,
     load_distance,
 )
+from alpasim_plugin.lab.video_metrics.objects import object_metrics
 from alpasim_plugin.lab.video_metrics.road import road_mask
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
@@ -46,7 +48,7 @@ from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 6  # of what a row holds and how it is measured; part of its key
+VERSION = 7  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip
@@ -189,10 +191,14 @@ def measure(
     weights: Path | None = None,
 ) -> dict[str, Any]:
     """Return the row of one clip under one variant (`alpasim_plugin.lab.video_metrics.summary`);
-    ``weights`` is the folder of I3D.
+    ``weights`` is the folder of I3D and of detectors.
     """
     truth = None if variant.label == TRUTH else clip.truth
     quality = clip_quality(result.video, truth, networks, road_mask(clip.sdmap))
+    values = quality.means
+    if truth is not None and weights is not None and available_detectors(weights):
+        K = intrinsics_of(clip.identity.get("camera"), clip.name)
+        values |= object_metrics(result.video, truth, clip.sdmap, K, weights)
     later_blocks = result.ms_per_frame[1:] or result.ms_per_frame  # the first one is shorter
     return {
         "arm": variant.label,
@@ -201,7 +207,7 @@ def measure(
         "seed": seed,
         "frames": len(clip.t_us),
         "size": list(clip.truth.shape[1:3]),
-        "values": quality.means,
+        "values": values,
         "identical": quality.identical,
         "events": dict(result.events),
         "ms_per_frame": [round(ms, 4) for ms in later_blocks],
@@ -277,7 +283,7 @@ def row_key(clip: QualityClip, work: Work) -> str:
 
 def metric_digests(folder: Path | None) -> dict[str, str]:
     """Return the metrics that there are weights for, each with the digest of what calibrates it."""
-    return digests(folder) | available_i3d(folder)
+    return digests(folder) | available_i3d(folder) | available_detectors(folder)
 
 
 def finish(work: Work) -> dict[str, Any]:

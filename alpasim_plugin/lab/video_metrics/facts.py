@@ -17,13 +17,16 @@ GRID = {4: "grid_4", 16: "grid_16"}  # by the side of a cell, pixels
 
 @dataclass(frozen=True)
 class Fact:
-    """How a metric is read; values of a table are multiplied by ``scale``."""
+    """How a metric is read; values of a table are multiplied by ``scale``. Clips in which an
+    optional one is not defined are left out.
+    """
 
     unit: str
     direction: Literal["higher", "lower"]
     title: str
     digits: int = 4
     scale: float = 1.0
+    optional: bool = False
 
 
 FACTS = {
@@ -35,7 +38,12 @@ FACTS = {
     "dists": Fact("", "lower", "DISTS"),
     WARP: Fact("", "lower", "Warp L1 x 1e4", 1, 1e4),
     WARP_LATE: Fact("", "lower", "late Warp L1 x 1e4", 1, 1e4),
-    WARP_LATE_ROAD: Fact("", "lower", "late Warp L1 of the road x 1e4", 1, 1e4),
+    WARP_LATE_ROAD: Fact("", "lower", "late Warp L1 of the road x 1e4", 1, 1e4, optional=True),
+    "cuboid_f1": Fact("", "higher", "Cuboid F1", optional=True),
+    "cuboid_clean_precision": Fact("", "higher", "precision on clean frames", optional=True),
+    "cuboid_clean_recall": Fact("", "higher", "recall on clean frames", optional=True),
+    "lane_f1": Fact("", "higher", "Lane F1", optional=True),
+    "lane_error_m": Fact("m", "lower", "lane error, m", 3, optional=True),
     DRIFT: Fact("dB", "higher", "drift, dB", 2),
     GRID[4]: Fact("", "lower", "grid of 4", 3),
     GRID[16]: Fact("", "lower", "grid of 16", 3),

@@ -42,7 +42,7 @@ def road_mask(sdmap: U8) -> Bool:
 def _road_of_frame(image: U8) -> Bool:
     width = image.shape[1]
     inked = image.any(axis=-1)
-    marking = _is_marking(image)
+    marking = is_marking(image)
     other = inked & ~marking
     # The grey edges of a box have the direction of white paint: they lie beside its faces
     reach_px = int(np.ceil(BOX_EDGE_PX * width / WIDTH_DEFINED_AT_PX)) + 1
@@ -57,7 +57,7 @@ def _road_of_frame(image: U8) -> Bool:
     return between & ~other
 
 
-def _is_marking(image: U8) -> Bool:
+def is_marking(image: U8) -> Bool:
     """Return which pixels ``(H, W)`` have the colour of something on the road, however faded."""
     colours = np.array([COLOURS[name] for name in ON_THE_ROAD], dtype=np.float32)
     colours /= np.linalg.norm(colours, axis=1, keepdims=True)

@@ -82,8 +82,11 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
 
 
 def metrics_of(rows: Sequence[Row]) -> list[str]:
-    """Return the metrics that every row carries, in the order of the tables."""
-    return [metric for metric in FACTS if all(_carries(row, metric) for row in rows)]
+    """Return the metrics that every row carries, and the optional ones that any does, in the order
+    of the tables.
+    """
+    needed = {metric: any if fact.optional else all for metric, fact in FACTS.items()}
+    return [name for name, quorum in needed.items() if quorum(_carries(row, name) for row in rows)]
 
 
 def value_of(row: Row, metric: str) -> float:
@@ -92,8 +95,11 @@ def value_of(row: Row, metric: str) -> float:
 
 
 def scene_values(rows: Sequence[Row], metric: str) -> list[float]:
-    """Return the mean over clips of every scene, in the order of their first rows."""
-    return _scene_means(rows, [value_of(row, metric) for row in rows])
+    """Return the mean over the clips of every scene that carry a metric, in the order of their
+    first rows.
+    """
+    carried = [row for row in rows if _carries(row, metric)]
+    return _scene_means(carried, [value_of(row, metric) for row in carried])
 
 
 def _scene_means(rows: Sequence[Row], values: Sequence[float]) -> list[float]:
@@ -122,8 +128,11 @@ def _paired(rows: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, A
     pairs = [(rows[clip], baseline[clip]) for clip in rows if clip in baseline]
     out: dict[str, Any] = {}
     for metric in metrics_of([row for pair in pairs for row in pair]):
-        by_clip = [value_of(a, metric) - value_of(b, metric) for a, b in pairs]
-        differences = np.array(_scene_means([a for a, _ in pairs], by_clip))
+        carried = [(a, b) for a, b in pairs if _carries(a, metric) and _carries(b, metric)]
+        if not carried:
+            continue
+        by_clip = [value_of(a, metric) - value_of(b, metric) for a, b in carried]
+        differences = np.array(_scene_means([a for a, _ in carried], by_clip))
         gains = differences if FACTS[metric].direction == "higher" else -differences
         interval = median_interval(differences, "scenes")
         out[metric] = {

@@ -15,6 +15,7 @@ from alpasim_plugin.block_fixers.sizes import DiTSizes
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.fixers.bundle import save_bundle
 from alpasim_plugin.lab.bench import quality
 from alpasim_plugin.lab.bench.quality import Work, finish, measure_quality, shown_frames
@@ -25,6 +26,7 @@ from alpasim_plugin.lab.video_metrics.summary import summarise
 from alpasim_plugin.lab.video_metrics.table import markdown
 from tests.block_fixers.fixer_cases import small_settings
 from tests.lab.training.pair_files import make
+from tests.lab.video_metrics.scripted_detectors import LaneDetector, save_script
 
 FRAMES = 14
 
@@ -95,6 +97,27 @@ def test_a_table_a_document_charts_and_pictures(data, bundle, tmp_path, capsys):
 
     table = (out / "quality.md").read_text()
     assert table.count("| identity |") == 2
+
+
+def test_detectors_from_the_folder_of_weights_are_in_the_table(tmp_path, capsys):
+    root = tmp_path / "pairs"
+    camera = {"K": [[20.0, 0.0, 24.0], [0.0, 20.0, 16.0], [0.0, 0.0, 1.0]]}
+    make(root, "test-known", "a", frames=2, camera=camera)
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    save_script(LaneDetector(), weights / "lane_detector.pt")
+    command = ["bench", "quality", str(root), "--out", str(tmp_path / "out"), "--pictures", "0"]
+    assert run_command([*command, "--metric-weights", str(weights), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["arms"]["3dgs"]["lane_f1"]["mean"] == 1.0
+    sha256 = file_sha256(weights / "lane_detector.pt")
+    assert summary["run"]["networks"]["lane_f1"] == sha256
+    assert "cuboid_f1" not in summary["arms"]["3dgs"]
+    assert "Lane F1" in (tmp_path / "out" / "quality.md").read_text()
+
+    make(root, "test-known", "b", frames=2)
+    assert run_command([*command, "--metric-weights", str(weights)]) == 2
+    assert "camera" in capsys.readouterr().err
 
 
 def test_clips_that_end_in_another_order_keep_their_rows_and_pictures(tmp_path, monkeypatch):
