@@ -8,6 +8,7 @@ import ctypes
 import locale
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -147,6 +148,13 @@ def run_out_of_memory(value):
     raise MemoryError("10 GB")
 
 
+def allocate(value):
+    """Ask for 10 GB in earnest, where the system gives no more than 8: no test fills a machine."""
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, hard))
+    return np.ones(10 << 30, dtype=np.uint8)
+
+
 def recurse(value):
     return recurse(value)
 
@@ -154,6 +162,33 @@ def recurse(value):
 def lie(value):
     """Return something else."""
     return SimpleNamespace(xy="here")
+
+
+def plan_no_number(plan):
+    return replace(plan, xy=np.full_like(plan.xy, np.nan))
+
+
+def plan_late(plan):
+    """Plan from a second on, at every step."""
+    return replace(plan, times_us=plan.times_us + 1_000_000)
+
+
+def plan_too_far(plan):
+    """Plan 200,000 poses."""
+    times_us = plan.t_us + 1_000 * np.arange(200_000)
+    return replace(
+        plan, times_us=times_us, xy=np.zeros((len(times_us), 2)), yaw=np.zeros(len(times_us))
+    )
+
+
+def plan_too_many(plan):
+    """Sample 200,000 alternatives."""
+    sample = np.zeros((len(plan.times_us), 3))
+    return replace(plan, samples=(sample,) * 200_000)
+
+
+def plan_and_say_too_much(plan):
+    return replace(plan, debug={"words": "x" * 100_000_000})
 
 
 FAULTS = {
@@ -182,12 +217,25 @@ FAULTS = {
         close_files,
         close_output,
         run_out_of_memory,
+        allocate,
         recurse,
         lie,
     )
 }
+# What only a plan can be.
+FAULTS_OF_PLANS = {
+    fault.__name__: fault
+    for fault in (
+        plan_no_number,
+        plan_late,
+        plan_too_far,
+        plan_too_many,
+        plan_and_say_too_much,
+    )
+}
 # What harms nobody but, perhaps, the part itself: its rollout may be as good as any.
 HARMLESS = {
+    "plan_and_say_too_much",
     "start_thread",
     "fork",
     "start_process",
@@ -258,9 +306,11 @@ def _evaluator(fault):
 for _kind in (_policy, _renderer, _fixer, _evaluator):
     for _name, _fault in FAULTS.items():
         globals()[f"{_kind.__name__[1:]}_{_name}"] = _kind(_fault)
+for _name, _fault in FAULTS_OF_PLANS.items():
+    globals()[f"policy_{_name}"] = _policy(_fault)
 
 
 if __name__ == "__main__":
     from alpasim_plugin import serve_policy
 
-    serve_policy(_policy(FAULTS[sys.argv[1]]))
+    serve_policy(_policy((FAULTS | FAULTS_OF_PLANS)[sys.argv[1]]))

@@ -12,7 +12,7 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.reader import read_json
-from tests.runs.bad_parts import FAULTS, HARMLESS
+from tests.runs.bad_parts import FAULTS, FAULTS_OF_PLANS, HARMLESS
 
 FILE = Path(__file__).with_name("bad_parts.py")
 SHORT = ("--set", "timing.duration_us=900000", "--set", "timing.warmup_us=200000", "--no-report")
@@ -67,7 +67,7 @@ def check(folder, manifests, key, kind, faults):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("faults", [tuple(FAULTS)], ids=["all"])
+@pytest.mark.parametrize("faults", [(*FAULTS, *FAULTS_OF_PLANS)], ids=["all"])
 def test_a_bad_policy_is_named_and_ends_no_other_rollout(tmp_path, alone, faults):
     code, manifests = drive(
         tmp_path, ["constant-velocity", *bad("policy", faults)], ("clean",), 2, *limit(faults)
@@ -110,7 +110,7 @@ def test_a_bad_evaluator_is_named_and_keeps_the_logs(tmp_path, alone, fault):
 @pytest.mark.slow
 def test_a_bad_served_policy_is_named_and_ends_no_other_rollout(tmp_path, alone):
     python = shlex.quote(sys.executable)
-    faults = tuple(FAULTS)
+    faults = (*FAULTS, *FAULTS_OF_PLANS)
     commands = [f"exec:{python} {FILE} {fault}" for fault in faults]
     driven = ["constant-velocity", *commands]
     code, manifests = drive(tmp_path, driven, ("clean",), 2, *limit(faults))
