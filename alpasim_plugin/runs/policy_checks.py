@@ -1,5 +1,6 @@
 """Check the user's policies before a run drives, for the pages of its failures."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,7 +26,8 @@ from alpasim_plugin.runs.plan import RunPlan
 from policies.base import make_policy
 from policies.conformance import check_policy
 
-LIMIT_S = 120.0
+LIMIT_S = 120.0  # of a check that has a core to itself
+MOST_LIMIT_S = 600.0  # of one that shares it with others
 HANGS = "hangs"
 HUNG_SHARE = 0.5  # of the time limit, in one call
 NEVER_DRIVES = ("made", "sensors", HANGS)  # breaches that no rollout survives
@@ -116,7 +118,7 @@ def _checked(
     Raises:
         InputError: A scenario lacks a camera of a policy.
     """
-    limit_s = how.limit_s or LIMIT_S
+    limit_s = how.limit_s or default_limit_s(os.getloadavg()[0], os.cpu_count() or 1)
     results = run_jobs(
         partial(_check, scenarios),
         policies,
@@ -167,14 +169,29 @@ def hanging(checks: Mapping[str, PolicyCheck]) -> dict[str, str]:
     }
 
 
-def _of_lost(lost: Lost, limit_s: float | None) -> PolicyCheck:
+def default_limit_s(load: float, cores: int) -> float:
+    """Return how many seconds the check of a policy may take where no time limit is given: longer
+    where processes share the cores, since a healthy policy takes longer there as well.
+
+    Args:
+        load: Mean number of processes that run or wait for a core.
+        cores: Of the machine.
+
+    Example:
+        >>> [default_limit_s(load, 2) for load in (0.0, 2.0, 5.0, 50.0)]
+        [120.0, 120.0, 300.0, 600.0]
+    """
+    return min(max(LIMIT_S, LIMIT_S * load / cores), MOST_LIMIT_S)
+
+
+def _of_lost(lost: Lost, limit_s: float) -> PolicyCheck:
     """Return what the check of a policy found whose process was lost."""
     sentence = f"the check did not end: {lost.reason}"
     name = "ends"
     culprit = lost.culprit
     if culprit is not None:
         sentence = culprit.error(lost.reason).message
-        is_slow = lost.is_late and lost.hung_s < HUNG_SHARE * (limit_s or LIMIT_S)
+        is_slow = lost.is_late and lost.hung_s < HUNG_SHARE * limit_s
         name = name if is_slow else HANGS
     return PolicyCheck(None, breaches=((name, sentence),))
 
