@@ -12,6 +12,7 @@ from evaluators.pages.runs import find_runs
 from evaluators.results import Change
 from evaluators.statistics.history import PastRun, changes_between
 from tests.core.checksum_files import vouch_for
+from tests.pages.browser import Browser, find_chromium
 from tests.pages.make_run import Plan, make_run
 
 SCENES = ("scene-a", "scene-b", "scene-c")
@@ -78,6 +79,20 @@ def test_the_page_lists_unfinished_and_damaged_runs_and_escapes_names(runs):
     assert "damaged: " in page
     assert "http:" not in page
     assert "https:" not in page
+
+
+@pytest.mark.slow
+def test_the_bars_of_outcomes_have_their_colours_in_a_browser(runs):
+    executable = find_chromium()
+    if executable is None:
+        pytest.skip("no Chromium is installed")
+    with Browser(executable) as browser:
+        browser.open(list_runs(runs))
+        colours = browser.evaluate(
+            "[...document.querySelectorAll('.ended > *')].map(e => getComputedStyle(e).backgroundColor)"
+        )
+    assert colours
+    assert "rgba(0, 0, 0, 0)" not in colours  # transparent: white words would be on white
 
 
 def test_a_page_of_somebody_else_is_left_as_it_is(runs, capsys):
