@@ -42,7 +42,13 @@ class Curves {
   }
 
   // What a metric is called; a run of an earlier version may not say.
-  label(name) { return this.index.metrics[name]?.label || name.replaceAll("_", " "); }
+  // A name that ends with its unit goes without it: the unit stands beside it.
+  label(name) {
+    const facts = this.index.metrics[name];
+    const suffix = facts?.unit ? "_" + facts.unit.replace("/", "p") : "";
+    const plain = suffix && name.endsWith(suffix) ? name.slice(0, -suffix.length) : name;
+    return facts?.label || plain.replaceAll("_", " ");
+  }
 
   draw() {
     this.charts = this.names.filter((name) => this.chosen.has(name)).map((name) => this.chart(name));
