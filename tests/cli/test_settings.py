@@ -26,7 +26,7 @@ def scene(tmp_path):
 
 def test_the_challenge_s_settings_are_those_of_its_public_configuration(scene):
     settings = load_settings("challenge")
-    assert (settings.preset, settings.workers) == ("alpasim@6f1029c", 2)
+    assert (settings.preset, settings.workers) == ("alpasim", 2)
     scenario = load_scenario(scene, overrides=settings.overrides)
     assert scenario.route_offset_m == 40.0
     assert scenario.warmup_us == 1_700_000
