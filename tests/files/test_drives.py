@@ -340,6 +340,7 @@ def test_the_page_of_a_drive_holds_no_markup_of_its_files(tmp_path):
     quality = {
         "photographs": {},
         "coverage": [],
+        "measured": None,
         "notes": drive.notes,
         "fitted": 2,
         "obstacles": {"boxes": 0, "cleared_cells": 0},
