@@ -145,8 +145,24 @@ def inspect_rollout(root: Path, cell: str, full: bool = False) -> RolloutState:
 
 
 def write_run_json(root: Path, info: RunInfo) -> None:
-    """Write ``run.json``."""
-    write_json(root / RUN_INFO, json_of(info))
+    """Write ``run.json``. It is then the newest beside those of the folders beside, also where the
+    clock was set back since they were written.
+    """
+    path = root / RUN_INFO
+    write_json(path, json_of(info))
+    folder = root.absolute()
+    others = [file for file in folder.parent.glob(f"*/{RUN_INFO}") if file.parent != folder]
+    latest_ns = max(map(_written_ns, others), default=0)
+    if latest_ns >= _written_ns(path):
+        os.utime(path, ns=(latest_ns + 1, latest_ns + 1))
+
+
+def _written_ns(path: Path) -> int:
+    """Return when a file was written, nanoseconds by the wall clock; 0 where it is gone."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def read_run_json(root: Path) -> RunInfo:
