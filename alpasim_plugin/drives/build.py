@@ -257,18 +257,19 @@ def write_folder(
         coverage,
         measured_range(written, written.cameras),
     )
-    length_us = int(log.ego_log.t_us[-1])
+    write_text(work / SCENARIO_FILE, _scenario_text(drive, scene_id, int(log.ego_log.t_us[-1])))
+    return quality
+
+
+def _scenario_text(drive: SourceDrive, scene_id: str, length_us: int) -> str:
+    """Return the scenario file of an imported drive of a length."""
     timing = ""
     if length_us < SHORT_US:
         timing = "timing: {start_us: 0, warmup_us: 0}  # a short recording: driven from its first pose on\n"
-    write_text(
-        work / SCENARIO_FILE,
-        (
-            f"# A recorded drive, imported from {drive.scene_id}; quality.md says how good it is.\n"
-            f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
-        ),
+    return (
+        f"# A recorded drive, imported from {drive.scene_id}; quality.md says how good it is.\n"
+        f"version: 1\nscene_id: {scene_id}\ndescription: A recorded drive of {length_us / 1e6:.1f} s.\nlog: {{drive: .}}\n{timing}"
     )
-    return quality
 
 
 def read_inputs(

@@ -124,14 +124,7 @@ def real(
     for scenario in recorded.values():
         unseen_cameras(scenario)
     bench.check_policies(recorded, built)
-    images: list[Row] = []
-    gaps: list[dict[str, Any]] = []
-    if recorded:
-        judges = _judges(console)
-        for name, scenario in recorded.items():
-            image_part, gap_part = bench.measure(name, scenario, judges)
-            images += image_part
-            gaps += gap_part
+    images, gaps = bench.measure_recorded(recorded)
     for name, scenario in built.items():
         gaps += bench.measure_built(name, scenario, offsets_m)
     _say(images, gaps, len(scenarios), as_json, console)
@@ -163,10 +156,24 @@ class _Bench:
             for scenario in built.values():
                 _cameras_of(policy, scenario)
 
-    def measure(
+    def measure_recorded(
+        self, recorded: Mapping[str, Scenario]
+    ) -> tuple[list[Row], list[dict[str, Any]]]:
+        """Return the rows of images and of plans of drives with photographs."""
+        images: list[Row] = []
+        gaps: list[dict[str, Any]] = []
+        if not recorded:
+            return images, gaps  # no network is loaded
+        judges = _judges(self.console)
+        for name, scenario in recorded.items():
+            image_part, gap_part = self._measured(name, scenario, judges)
+            images += image_part
+            gaps += gap_part
+        return images, gaps
+
+    def _measured(
         self, name: str, scenario: Scenario, judges: Judges
     ) -> tuple[list[Row], list[dict[str, Any]]]:
-        """Return the rows of images and of plans of a drive with photographs."""
         shots = shots_of(scenario)
         rendered = rendered_shots(
             scenario, self._makers(scenario), shots, partial(_tell, self.console, name)
