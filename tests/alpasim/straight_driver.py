@@ -1,7 +1,7 @@
 """A driver of AlpaSim's EgodriverService that goes straight on from a session's newest pose; as a
 program it serves at the address in ``SIMRUN_POLICY_ADDRESS``.
 
-With ``needs-its-folder`` it ends where the folder of its code cannot be written; with
+With ``needs-folder=FOLDER`` it ends where that folder cannot be written; with
 ``writes-to=FILE`` it writes to a file at each session's start; with ``counts-in=FILE`` it counts its
 processes in a file, and each drives 1 m/s faster than the one before.
 """
@@ -68,10 +68,10 @@ class StraightDriver:
 
 
 def main():
-    folder = Path(__file__).parent
-    if "needs-its-folder" in sys.argv and not os.access(folder, os.W_OK):
-        sys.exit(f"cannot write to {folder}")
     options = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+    folder = options.get("needs-folder")
+    if folder is not None and not os.access(folder, os.W_OK):
+        sys.exit(f"cannot write to {folder}")
     speed_mps = 5.0
     if "counts-in" in options:
         with open(options["counts-in"], "a+") as counter:

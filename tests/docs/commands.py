@@ -19,7 +19,7 @@ NO_COMMAND = (
 NOT_RUN = (  # the first rule that fits counts
     *((pattern, "not understood yet") for pattern in NO_COMMAND),
     (
-        r"runs/versions|exec:env",
+        r"runs/versions|exec:env|exec:\?cameras=all env",
         "of the challenge's page; test_challenge_page.py runs it",
     ),
     (r"gate --self-test", "minutes; tests/runs/test_self_test.py runs it"),
