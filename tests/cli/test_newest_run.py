@@ -7,12 +7,23 @@ from alpasim_plugin.log.run_folder.manifests import write_run_json
 from alpasim_plugin.log.run_folder.schema import RUN_INFO
 from tests.run_records import run_info
 
+MEMBERS = {
+    "key": "k",
+    "content": "c",
+    "command": ["simrun"],
+    "preset": "strict",
+    "renderers": ["clean"],
+    "policies": ["p"],
+    "seeds": [0],
+    "scenes": {},
+    "version": "0",
+}
 HOUR_NS = 3_600_000_000_000
 
 
 def written(folder):
     folder.mkdir(parents=True, exist_ok=True)
-    write_run_json(folder, run_info({"key": "k", "content": "c"}))
+    write_run_json(folder, run_info(MEMBERS))
     return folder
 
 
