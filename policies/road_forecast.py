@@ -46,7 +46,7 @@ class RoadUser:
 
 
 class RoadUsers:
-    """Road users with their velocities, which are told by two observations.
+    """Road users with their velocities, which are estimated from two observations.
 
     Args:
         actors: Their sizes and kinds.

@@ -174,16 +174,16 @@ def program(command: Command) -> Command:
     return programs.get(command[0], command[:1]) + command[1:]
 
 
-def required_mb(name: str, seen: set[str]) -> float:
+def required_mb(name: str, counted_names: set[str]) -> float:
     """Return the size of a distribution's files and of all that it requires, megabytes.
 
     Args:
         name: Of an installed distribution; one that is not installed, as on another system, counts 0.
-        seen: Names that were counted before; grows.
+        counted_names: Names that were counted before; grows.
     """
-    if name.lower() in seen:
+    if name.lower() in counted_names:
         return 0.0
-    seen.add(name.lower())
+    counted_names.add(name.lower())
     try:
         installed = distribution(name)
     except PackageNotFoundError:
@@ -191,7 +191,7 @@ def required_mb(name: str, seen: set[str]) -> float:
     files = [Path(installed.locate_file(file)) for file in installed.files or []]
     size_mb = sum(file.stat().st_size for file in files if file.is_file()) / 1e6
     required = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in requirements_of(installed)]
-    return size_mb + sum(required_mb(other, seen) for other in required)
+    return size_mb + sum(required_mb(other, counted_names) for other in required)
 
 
 def requirements_of(installed: Distribution) -> list[str]:

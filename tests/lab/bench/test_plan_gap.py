@@ -201,15 +201,15 @@ def test_what_cannot_be_asked_is_refused_or_said(drive):
         roles_of(resolve("policy", "log-replay"), drive, series)
     turn = np.eye(4)
     turn[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # to the right, in the camera's frame
-    aside = [
+    facing_right = [
         replace(image, T_world_camera=image.T_world_camera @ turn) for image in series["right"]
     ]
     spec = resolve("policy", f"{HERE}:Steers")
-    roles, notes = roles_of(spec, drive, {"front": series["front"], "right": aside})
+    roles, notes = roles_of(spec, drive, {"front": series["front"], "right": facing_right})
     assert [role.is_moved for role in roles] == [False]
     assert notes == [f"{spec.name}: camera right looks 90 degrees away from front"]
     with pytest.raises(InputError, match="90 degrees away"):
-        roles_of(spec, drive, {"right": aside})
+        roles_of(spec, drive, {"right": facing_right})
     other_lens = replace(series["right"][3], K=series["right"][3].K * 1.1)
     mixed = [*series["right"][:3], other_lens]
     with pytest.raises(InputError, match="several calibrations"):

@@ -4,7 +4,7 @@ import torch
 
 
 class BoxDetector(torch.nn.Module):
-    """Finds a box as far aside as the image is bright, or nothing in a black one."""
+    """Finds a box as far to the side as the image is bright, or nothing in a black one."""
 
     def forward(
         self, image: torch.Tensor, K: torch.Tensor
@@ -16,7 +16,7 @@ class BoxDetector(torch.nn.Module):
 
 
 class LaneDetector(torch.nn.Module):
-    """Finds a straight lane as far aside as the image is bright."""
+    """Finds a straight lane as far to the side as the image is bright."""
 
     def forward(
         self, image: torch.Tensor, K: torch.Tensor
