@@ -255,7 +255,7 @@ class _Expert:
         step = MAX_JERK_MPS3 * dt_s
         # The brake is released while stopping: v = a^2 / 2 j leaves no jolt at standstill.
         wanted = max(wanted, -float(np.sqrt(2.0 * STOP_JERK_MPS3 * self.v)))
-        self.a = float(np.clip(wanted, self.a - step, self.a + step))
+        self.a = min(max(wanted, self.a - step), self.a + step)
         self.a = max(self.a, -self.v / dt_s)  # it stands
         self.s, self.v = moved_on(self.s, self.v, self.a, dt_s)
 

@@ -149,7 +149,9 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
     """
     half = np.column_stack([bodies.half_length_m[row], bodies.half_width_m[row]])
     turn = np.array([np.cos(bodies.yaw[row]), np.sin(bodies.yaw[row])])
-    x, y = np.moveaxis(_OUTLINE * half[:, None], -1, 0)  # (P, 6)
+    corners = _OUTLINE * half[:, None]  # (P, 6, 2)
+    x = corners[..., 0]
+    y = corners[..., 1]
     outline = bodies.xy[row][:, None] + np.stack(
         [turn[0, :, None] * x - turn[1, :, None] * y, turn[1, :, None] * x + turn[0, :, None] * y],
         axis=-1,
@@ -217,6 +219,8 @@ def find_leaders(
         margin_m: Added to the half width.
         lets_merge: Whether drivers let in who merges from beside.
     """
+    if len(bodies.xy) == 0:  # an empty road: half of the calls of a built scene
+        return [NO_LEADER] * len(line)
     start, _ = lines.at(line, front_s_m)
     delta = bodies.xy - start[:, None, :2]
     reaches = horizon_m[:, None] + bodies.half_length_m + 5.0

@@ -237,9 +237,9 @@ class Lines:
 
     def at(self, line: I64, s_m: F64, offset_m: float | F64 = 0.0) -> tuple[F64, F64]:
         """Return points ``(P, 3)`` and headings ``(P,)``; see `Path.at`."""
-        s = np.clip(s_m, 0.0, self.length_m[line])
+        s = np.minimum(np.maximum(s_m, 0.0), self.length_m[line])
         i = np.searchsorted(self._key, s + self._base[line], side="right") - 1
-        i = np.clip(i, self.begin[line], self.end[line] - 2)
+        i = np.minimum(np.maximum(i, self.begin[line]), self.end[line] - 2)
         f = (s - self.s[i]) / (self.s[i + 1] - self.s[i])
         yaw = self.yaw[i] + f * (self.yaw[i + 1] - self.yaw[i])
         xyz = self.xyz[i] + f[:, None] * (self.xyz[i + 1] - self.xyz[i])

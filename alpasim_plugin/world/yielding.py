@@ -64,6 +64,8 @@ def yielding_acceleration(
         ahead: Everyone who moves.
     """
     n, k = ahead.yaw.shape
+    if k == 0:
+        return float("inf")
     everybody = bodies_from(
         ahead.xy.reshape(-1, 2),
         ahead.yaw.reshape(-1),

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from alpasim_plugin.core.types import Box
 from alpasim_plugin.world.idm import (
+    NO_LEADER,
     IdmParams,
     bodies_from,
     concatenate,
@@ -15,6 +16,7 @@ from alpasim_plugin.world.idm import (
     idm_acceleration,
 )
 from alpasim_plugin.world.path import Lines, polyline_path
+from alpasim_plugin.world.yielding import TIMES_S, PredictedBodies, yielding_acceleration
 
 P = IdmParams(desired_speed_mps=20.0, headway_s=1.5, min_gap_m=2.0, accel_mps2=1.0, brake_mps2=1.5)
 STRAIGHT = polyline_path(np.column_stack([np.linspace(0, 200, 201), np.zeros((201, 2))]))
@@ -136,3 +138,41 @@ def test_the_leaders_of_many_drivers_are_those_of_each():
 
 def test_oncoming_leader_counts_as_standing():
     assert find_leader(ROAD, 10.0, 0.95, car(40, 0, np.pi, 8.0)).speed_mps == 0.0
+
+
+class Unasked(Lines):
+    """Lines that nothing may be projected onto."""
+
+    def at(self, line, s_m, offset_m=0.0):
+        raise AssertionError("a place on a line was asked for")
+
+    def stations(self, line, low_m, high_m):
+        raise AssertionError("stations of a line were asked for")
+
+
+def test_on_an_empty_road_nothing_is_followed_and_nothing_projected():
+    lines = Unasked([STRAIGHT, STRAIGHT])
+    two = np.arange(2)
+    leaders = find_leaders(
+        lines, two, np.zeros(2), np.ones(2), nobody(), np.full(2, 100.0), np.full(2, -1)
+    )
+    assert leaders == [NO_LEADER, NO_LEADER]
+
+
+def test_where_nobody_is_expected_nothing_limits_the_acceleration():
+    rows = len(TIMES_S)
+    none_ahead = PredictedBodies(
+        xy=np.zeros((rows, 0, 2)),
+        yaw=np.zeros((rows, 0)),
+        velocity=np.zeros((rows, 0, 2)),
+        present=np.zeros((rows, 0), dtype=bool),
+        boxes=(),
+        z=np.zeros((rows, 0)),
+        yields=np.zeros(0, dtype=bool),
+    )
+    line = Unasked([STRAIGHT])
+    assert yielding_acceleration(line, 10.0, 8.0, Box(4.6, 1.85, 1.5), none_ahead) == INF
+
+
+def nobody():
+    return bodies_from(np.zeros((0, 2)), np.zeros(0), [], np.zeros((0, 2)))
