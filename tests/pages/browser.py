@@ -30,6 +30,16 @@ LAUNCH = (
     "os.dup2(r, 3); os.dup2(w, 4); os.execv(sys.argv[3], sys.argv[3:])"
 )
 
+# Numbers of an axis that lie on a plot, where curves would cross them; the curves too are counted.
+LIMITS_ON_PLOTS = """(() => {
+  const graphs = [...document.querySelectorAll('.curve .graph')];
+  const meets = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+  const box = (node) => node.getBoundingClientRect();
+  const crossed = graphs.flatMap((graph) => [...graph.querySelectorAll('.limits span')]
+    .filter((limit) => meets(box(limit), box(graph.querySelector('.plot')))));
+  return [graphs.length, crossed.map((limit) => limit.textContent)];
+})()"""
+
 
 def find_chromium():
     """Return the path of an installed Chromium, or None."""

@@ -10,7 +10,7 @@ from alpasim_plugin.runs.reports import failure_cause
 from evaluators.pages.cause import log_so_far, write_cause
 from evaluators.statistics.cause import worst_failure
 from evaluators.statistics.opening import read_run
-from tests.pages.browser import Browser, find_chromium
+from tests.pages.browser import LIMITS_ON_PLOTS, Browser, find_chromium
 from tests.pages.make_run import Plan
 from tests.pages.make_watched import make_watched
 
@@ -56,6 +56,7 @@ def test_the_motion_is_drawn_with_images_and_without_and_nothing_complains(
     assert titles[0] == "Speed"
     assert titles[-1] == "Lateral offset"
     assert chromium.evaluate("document.querySelectorAll('#curves .failed').length") == len(titles)
+    assert chromium.evaluate(LIMITS_ON_PLOTS) == [len(titles), []]
     assert chromium.evaluate("document.getElementById('when').textContent")
     assert (chromium.evaluate("document.querySelectorAll('#layers').length") > 0) == bool(cameras)
     assert chromium.evaluate("document.documentElement.scrollWidth") <= width

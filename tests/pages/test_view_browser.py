@@ -13,6 +13,7 @@ from evaluators.pages.html import write_report
 from evaluators.pages.page import write_page
 from evaluators.statistics.opening import read_run
 from tests.pages.axe import MISSING, SERIOUS, find_axe, findings
+from tests.pages.browser import LIMITS_ON_PLOTS
 from tests.pages.make_run import Plan
 from tests.pages.make_watched import BARS, make_watched
 
@@ -43,6 +44,15 @@ def settled(browser):
 
 def seek(browser, ms):
     browser.evaluate(f"(async () => {{ player.seek({ms}); await player.drawn; }})()")
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_no_curve_crosses_the_numbers_of_its_axis(browser, page, width):
+    browser.open(page, width=width)
+    settled(browser)
+    count, crossed = browser.evaluate(LIMITS_ON_PLOTS)
+    assert count > 2
+    assert crossed == []
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True), (820, False)])

@@ -121,9 +121,12 @@ const chart = ({ name, unit, lines, text }, failed, span) => {
   const head = svg.appendChild(svgNode("line", { class: "head", x1: 0, x2: 0, y1: 0, y2: PLOT.height }));
   for (const line of lines) svg.append(svgNode("path", { class: `line ${line.kind}`, d: linePath(line, (t) => share(t, span), y) }));
   const node = make("figure", "curve"), plot = make("div", "plot"), caption = make("figcaption", "small");
-  plot.append(svg, make("span", "limit top num", `${shortNumber(high)} ${unit}`), make("span", "limit bottom num", shortNumber(low)));
-  caption.append(make("b", "", name), ...lines.map((line) => make("span", `line-name ${line.kind}`, line.name)));
-  node.append(caption, plot);
+  const graph = make("div", "graph"), limits = make("div", "limits num");
+  limits.append(make("span", "", shortNumber(high)), make("span", "", shortNumber(low)));
+  plot.append(svg);
+  graph.append(limits, plot);
+  caption.append(make("b", "", name), make("span", "muted", unit), ...lines.map((line) => make("span", `line-name ${line.kind}`, line.name)));
+  node.append(caption, graph);
   return { node, head };
 };
 

@@ -109,8 +109,11 @@ class Curves {
       return { curve, text, said: "" };
     });
     plot.append(svg, make("i", "playhead"));
-    if (values.length) plot.append(make("span", "limit top", shortNumber(high)), make("span", "limit bottom", shortNumber(low)));
-    node.append(head, plot);
+    // The limits stand beside the plot: a curve that reaches one would cross its number.
+    const graph = make("div", "graph"), limits = make("div", "limits num");
+    if (values.length) limits.append(make("span", "", shortNumber(high)), make("span", "", shortNumber(low)));
+    graph.append(limits, plot);
+    node.append(head, graph);
     const whys = [...new Set(drives.map(({ curve }) => curve.why).filter(Boolean))];
     if (!values.length && whys.length) node.append(make("p", "why small muted", "no valid value: " + whys.join("; ")));
     return { node, plot, reads, head: plot.querySelector(".playhead") };
