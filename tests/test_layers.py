@@ -52,6 +52,7 @@ STAGES = {
     "evaluators.statistics": (RUN_FOLDER, "evaluators.results", "evaluators.metrics"),
     "evaluators.alpasim": ("evaluators.metrics", "evaluators.statistics"),
     "evaluators.pages": (
+        A + "cameras",
         *LOG,
         RUN_FOLDER,
         "evaluators.results",

@@ -402,15 +402,44 @@ def projected(camera: CameraSpec, ray: F64) -> tuple[F64, Bool]:
     else:
         angle = np.arctan2(across, ray[:, 2])
         if lens.pixel_to_angle:
-            corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)])
-            reach = 2 * float(np.linalg.norm(corners - K[:2, 2], axis=1).max())
-            radius, good = _inverse(np.array(lens.pixel_to_angle), angle, reach, camera.name)
+            reach_px = _farthest_px(camera)
+            radius, good = _inverse(np.array(lens.pixel_to_angle), angle, reach_px, camera.name)
         else:
             radius = _value(_radius_of_angle(lens), angle)
             good = angle <= _growing(lens)
         plane = ray[:, :2] / np.maximum(across, 1e-12)[:, None] * radius[:, None]
         pixel = plane * K[[0, 1], [0, 1]] if lens.kind == "fisheye" else plane @ _linear(lens).T
     return pixel + K[:2, 2], good
+
+
+class Reach(NamedTuple):
+    """How far from its axis a lens is described, as `projected` flags rays.
+
+    Attributes:
+        slope: Of an OpenCV lens, the distance of a point at unit depth from the axis.
+        angle_rad: Of a fisheye or f-theta lens.
+        radius_px: Of an f-theta lens by its ``pixel_to_angle``, the distance from the middle that
+            shows that angle.
+    """
+
+    slope: float = 0.0
+    angle_rad: float = 0.0
+    radius_px: float = 0.0
+
+
+def reach_of(camera: CameraSpec) -> Reach:
+    """Return how far a camera's lens is described.
+
+    Raises:
+        InputError: Values that make no lens.
+    """
+    lens, _ = _checked(camera)
+    if lens.kind == "opencv":
+        return Reach(slope=_opencv_reach(camera))
+    if not lens.pixel_to_angle:
+        return Reach(angle_rad=_growing(lens))
+    radii, angles = _growing_table(np.array(lens.pixel_to_angle), _farthest_px(camera), camera.name)
+    return Reach(angle_rad=float(angles[-1]), radius_px=float(radii[-1]))
 
 
 class RadialForm(NamedTuple):
@@ -610,6 +639,12 @@ def _growing(lens: LensModel) -> float:
     return _grows_to(lambda angle: _value(polynomial, angle), _limit(lens))
 
 
+def _farthest_px(camera: CameraSpec) -> float:
+    """Return how far from its middle a camera's image is followed: twice the farthest corner."""
+    corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)])
+    return 2 * float(np.linalg.norm(corners - camera.K[:2, 2], axis=1).max())
+
+
 def _value(coefficients: Any, x: F64) -> F64:
     return np.polynomial.polynomial.polyval(x, np.asarray(coefficients))
 
@@ -618,17 +653,23 @@ def _inverse(polynomial: F64, values: F64, limit: float, name: str) -> tuple[F64
     """Solve ``polynomial(x) = value`` on [0, limit], as far as the polynomial grows; the flag says
     where there is a solution.
     """
-    table = np.linspace(0.0, limit, TABLE)
-    table_values = _value(polynomial, table)
-    falls = np.flatnonzero(np.diff(table_values) <= 0)
-    last = int(falls[0]) if len(falls) else TABLE - 1
-    _require(last > 0, name, "a polynomial that does not grow from the axis")
-    x = np.interp(values, table_values[: last + 1], table[: last + 1])
+    table, table_values = _growing_table(polynomial, limit, name)
+    x = np.interp(values, table_values, table)
     slope = np.polynomial.polynomial.polyder(polynomial)
     for _ in range(3):  # Newton, from within half a table step
         step = (_value(polynomial, x) - values) / np.maximum(_value(slope, x), 1e-9)
-        x = np.clip(x - step, 0.0, table[last])
-    return x, (values >= table_values[0]) & (values <= table_values[last])
+        x = np.clip(x - step, 0.0, table[-1])
+    return x, (values >= table_values[0]) & (values <= table_values[-1])
+
+
+def _growing_table(polynomial: F64, limit: float, name: str) -> tuple[F64, F64]:
+    """Return places on [0, limit] and a polynomial's values there, as far as it grows."""
+    table = np.linspace(0.0, limit, TABLE)
+    table_values = _value(polynomial, table)
+    falls = np.flatnonzero(np.diff(table_values) <= 0)
+    end = int(falls[0]) + 1 if len(falls) else TABLE
+    _require(end > 1, name, "a polynomial that does not grow from the axis")
+    return table[:end], table_values[:end]
 
 
 def _distorted(xy: F64, lens: LensModel) -> F64:

@@ -64,7 +64,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         them, of a newer version of the format; ``info``
         holds ``entries`` (count by kind), ``n_steps``, ``empty_plans`` and ``unanswered`` (drive
         requests without a plan), ``terminated`` (the driver ended the rollout), ``cameras``
-        (`CameraSpec` of the pinhole cameras), ``other_cameras`` (names of the rest), ``versions``,
+        (`CameraSpec` of each with its lens), ``other_cameras`` (names of those that none states), ``versions``,
         and ``undefined_actors`` (poses of ids that the header does not define are left out).
 
     Raises:

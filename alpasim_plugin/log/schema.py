@@ -400,20 +400,93 @@ def read_transform(pose: common_pb2.Pose, name: str) -> F64:
     return se3(xyz[0], quat[0])
 
 
-def read_camera(camera: sensorsim_pb2.AvailableCamerasReturn.AvailableCamera) -> CameraSpec | None:
-    """Return a pinhole camera, or None for a lens that no `CameraSpec` can state."""
-    spec = camera.intrinsics
-    if spec.WhichOneof("camera_param") != "opencv_pinhole_param":
+def read_lens(spec: sensorsim_pb2.CameraSpec, title: str) -> LensModel | None:
+    """Return the lens that intrinsics describe; None of a pinhole.
+
+    Raises:
+        InputError: No intrinsics, or more coefficients than a lens has.
+    """
+    kind = spec.WhichOneof("camera_param")
+    if kind == "opencv_pinhole_param":
+        return _opencv(spec.opencv_pinhole_param, title)
+    if kind == "opencv_fisheye_param":
+        fisheye = spec.opencv_fisheye_param
+        return LensModel("fisheye", tuple(fisheye.radial_coeffs), max_angle_rad=fisheye.max_angle)
+    if kind == "ftheta_param":
+        return _ftheta(spec.ftheta_param)
+    raise InputError(
+        f"{title}: no intrinsics",
+        "fill ftheta_param, opencv_pinhole_param or opencv_fisheye_param",
+    )
+
+
+def _opencv(p: sensorsim_pb2.OpenCVPinholeCameraParam, title: str) -> LensModel | None:
+    lengths = (p.radial_coeffs, 6), (p.tangential_coeffs, 2), (p.thin_prism_coeffs, 4)
+    if any(len(coefficients) > n for coefficients, n in lengths):
+        raise InputError(
+            f"{title}: more coefficients than k1..k6, p1, p2, s1..s4",
+            "give intrinsics that describe a lens",
+        )
+    k, t, s = ((*coefficients, *[0.0] * (n - len(coefficients))) for coefficients, n in lengths)
+    if not any((*k, *t, *s)):
         return None
-    p = spec.opencv_pinhole_param
-    if any((*p.radial_coeffs, *p.tangential_coeffs, *p.thin_prism_coeffs)):
-        return None
-    matrix = np.array(
+    return LensModel("opencv", (*k[:2], *t, *k[2:], *s))
+
+
+def _ftheta(p: sensorsim_pb2.FthetaCameraParam) -> LensModel:
+    forward = tuple(p.angle_to_pixeldist_poly)
+    backward = tuple(p.pixeldist_to_angle_poly)
+    linear = (1.0, 0.0, 0.0)
+    if p.HasField("linear_cde"):
+        linear = p.linear_cde.linear_c, p.linear_cde.linear_d, p.linear_cde.linear_e
+    goes_back = p.reference_poly == sensorsim_pb2.FthetaCameraParam.PIXELDIST_TO_ANGLE
+    if goes_back or not forward:
+        return LensModel("ftheta", forward, backward, linear, p.max_angle)
+    return LensModel("ftheta", forward, (), linear, p.max_angle)
+
+
+def read_matrix(spec: sensorsim_pb2.CameraSpec) -> F64:
+    """Return ``K`` ``(3, 3)`` of intrinsics; of an f-theta lens, whose polynomial is in pixels, with
+    focal lengths of 1.
+
+    Raises:
+        InputError: No intrinsics.
+    """
+    kind = spec.WhichOneof("camera_param")
+    if kind is None:
+        raise InputError(
+            f"camera {spec.logical_id!r}: no intrinsics",
+            "fill ftheta_param, opencv_pinhole_param or opencv_fisheye_param",
+        )
+    p = getattr(spec, kind)
+    focal = (1.0, 1.0)
+    if kind != "ftheta_param":
+        focal = p.focal_length_x, p.focal_length_y
+    return np.array(
         [
-            [p.focal_length_x, 0.0, p.principal_point_x],
-            [0.0, p.focal_length_y, p.principal_point_y],
+            [focal[0], 0.0, p.principal_point_x],
+            [0.0, focal[1], p.principal_point_y],
             [0.0, 0.0, 1.0],
         ]
     )
-    mounting = read_transform(camera.rig_to_camera, f"mounting of camera {camera.logical_id!r}")
-    return CameraSpec(camera.logical_id, spec.resolution_w, spec.resolution_h, matrix, mounting)
+
+
+def read_camera(camera: sensorsim_pb2.AvailableCamerasReturn.AvailableCamera) -> CameraSpec | None:
+    """Return a camera with its lens, or None where no `CameraSpec` can state what it sees: without
+    intrinsics, or behind a windshield.
+
+    Raises:
+        InputError: More coefficients than a lens has, or a bad mounting.
+    """
+    spec = camera.intrinsics
+    if spec.WhichOneof("camera_param") is None or spec.WhichOneof("external_distortion"):
+        return None
+    title = f"camera {camera.logical_id!r}"
+    return CameraSpec(
+        camera.logical_id,
+        spec.resolution_w,
+        spec.resolution_h,
+        read_matrix(spec),
+        read_transform(camera.rig_to_camera, f"mounting of {title}"),
+        lens=read_lens(spec, title),
+    )

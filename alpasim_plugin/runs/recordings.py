@@ -20,7 +20,7 @@ from alpasim_plugin.core.files.atomic import atomic_file
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_matrix
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.core.lazy import require_library
-from alpasim_plugin.core.types import F64, Box, CameraSpec, RolloutLog, Trajectory
+from alpasim_plugin.core.types import F64, Box, CameraSpec, LensModel, RolloutLog, Trajectory
 from alpasim_plugin.log import encode_image
 from alpasim_plugin.log.run_folder.rows import CellSeries, Rollout, series_by_rollout
 from evaluators.pages.cells import Logs, WatchedCell
@@ -295,8 +295,8 @@ def _metrics(metrics: CellSeries, label: str) -> Iterator[Item]:
 
 
 def _camera_items(camera: Source, log: RolloutLog, label: str) -> Iterator[Item]:
-    """Yield the calibration of a camera, where the log has it, and its images: those of a log byte
-    for byte, those of a video as JPEG.
+    """Yield the calibration of a camera, where the log has it and MCAP has a model of its lens, and
+    its images: those of a log byte for byte, those of a video as JPEG.
     """
     topic = f"/{label}/{camera.camera}"
     frame = topic[1:]
@@ -307,24 +307,38 @@ def _camera_items(camera: Source, log: RolloutLog, label: str) -> Iterator[Item]
         mounting = spec.T_rig_camera
         quat = quat_from_matrix(mounting[:3, :3])
         yield _transform(t_us, f"{label}/rig", frame, mounting[:3, 3], quat)
-        calibration = {
-            "timestamp": _time(t_us),
-            "frame_id": frame,
-            "width": spec.width,
-            "height": spec.height,
-            "distortion_model": "",
-            "D": [],
-            "K": spec.K.ravel().tolist(),
-            "R": np.eye(3).ravel().tolist(),
-            "P": np.column_stack([spec.K, np.zeros(3)]).ravel().tolist(),
-        }
-        yield t_us, f"{topic}/calibration", SCHEMAS["CameraCalibration"], calibration
+        distortion = _distortion(spec.lens)
+        if distortion is not None:
+            calibration = distortion | {
+                "timestamp": _time(t_us),
+                "frame_id": frame,
+                "width": spec.width,
+                "height": spec.height,
+                "K": spec.K.ravel().tolist(),
+                "R": np.eye(3).ravel().tolist(),
+                "P": np.column_stack([spec.K, np.zeros(3)]).ravel().tolist(),
+            }
+            yield t_us, f"{topic}/calibration", SCHEMAS["CameraCalibration"], calibration
     images = [(image.end_us, image.data) for image in camera.images]
     images += [(t_us, encode_image(rgb, "jpeg")) for t_us, rgb in camera.filmed()]
     for t_us, data in images:
         kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
         message = {"timestamp": _time(t_us), "frame_id": frame, "data": data, "format": kind}
         yield t_us, topic, SCHEMAS["CompressedImage"], message
+
+
+def _distortion(lens: LensModel | None) -> Message | None:
+    """Return the model of a lens by its name in `foxglove.CameraCalibration`; None where none of
+    them states it: an f-theta lens, and one with thin prism terms.
+    """
+    if lens is None:
+        return {"distortion_model": "", "D": []}
+    terms = [*lens.coefficients, *[0.0] * (12 - len(lens.coefficients))]
+    if lens.kind == "fisheye":
+        return {"distortion_model": "kannala_brandt", "D": terms[:4]}
+    if lens.kind == "opencv" and not any(terms[8:]):
+        return {"distortion_model": "rational_polynomial", "D": terms[:8]}
+    return None
 
 
 def _update(t_us: int, topic: str, entities: Sequence[Message], gone: Sequence[str] = ()) -> Item:

@@ -49,7 +49,15 @@ from evaluators.statistics.opening import Run
 JPEG_START = b"\xff\xd8"
 BEFORE_US, AFTER_US = 6_000_000, 1_000_000  # of the failure, that are shown
 MOST_QUERIES = 48
-SCRIPTS = ("theme.js", "timeline.js", "birdseye.js", "overlay.js", "curves.js", "cause.js")
+SCRIPTS = (
+    "theme.js",
+    "timeline.js",
+    "birdseye.js",
+    "lens.js",
+    "overlay.js",
+    "curves.js",
+    "cause.js",
+)
 STYLES = ("theme.css", "report.css", "cause.css")
 
 

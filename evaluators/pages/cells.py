@@ -13,6 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
+from alpasim_plugin.cameras.lens import reach_of
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files import real
 from alpasim_plugin.core.flags import Flag
@@ -362,18 +363,36 @@ def _cameras(
         by_ms = dict(zip(place.ms(list(trust)), trust.values(), strict=True))
         if by_ms:
             camera["trust"] = [by_ms.get(t_ms, "") for t_ms in camera["t"]]
-        if camera["name"] in specs:
-            camera["lens"] = lens_data(specs[camera["name"]], camera["width"])
+        spec = specs.get(camera["name"])
+        lens = None if spec is None else lens_data(spec, camera["width"])
+        if lens is not None:
+            camera["lens"] = lens
     return cameras
 
 
-def lens_data(camera: CameraSpec, width_px: int) -> JsonObject:
-    """Return what projects rig coordinates into an image of at most this width: fx, fy, cx, cy,
-    and the mounting, 3 rows of 4.
+def lens_data(camera: CameraSpec, width_px: int) -> JsonObject | None:
+    """Return what projects rig coordinates into an image of at most this width, as ``lens.js`` reads
+    it: the ``kind`` of lens, fx, fy, cx, cy at the calibrated size, the image's ``scale``, the
+    mounting ``T``, 3 rows of 4, and of a lens its terms and how far it is described. None where its
+    values make no lens.
     """
-    scale = min(1.0, width_px / camera.width)
-    k = [round(float(camera.K[index]) * scale, 3) for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    return {"k": k, "T": camera.T_rig_camera[:3].round(5).ravel().tolist()}
+    fx, fy, cx, cy = (float(camera.K[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    facts = {
+        "k": [fx, fy, cx, cy],
+        "scale": min(1.0, width_px / camera.width),
+        "T": camera.T_rig_camera[:3].ravel().tolist(),
+    }
+    lens = camera.lens
+    if lens is None:
+        return {"kind": "pinhole"} | facts
+    try:
+        reach = reach_of(camera)
+    except InputError:  # of a log that was written elsewhere: its image has no overlay
+        return None
+    facts |= {"kind": lens.kind, "terms": list(lens.coefficients), "reach": reach._asdict()}
+    if lens.kind == "ftheta":
+        facts |= {"inverse": list(lens.pixel_to_angle), "linear": list(lens.linear)}
+    return facts
 
 
 def index_data(

@@ -43,6 +43,7 @@ ORDINALS = {2: "second", 3: "third", 4: "fourth"}
 SCRIPTS = (
     "theme.js",
     "timeline.js",
+    "lens.js",
     "overlay.js",
     "cameras.js",
     "birdseye.js",

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.geometry import yaw_from_quat
-from alpasim_plugin.core.types import Frame
+from alpasim_plugin.core.types import Frame, LensModel
 from alpasim_plugin.log import AslWriter, decode_image, read_asl
 from alpasim_plugin.log.asl import AslReader
 from tests.log.make_rollout import (
@@ -126,6 +126,42 @@ def test_camera_survives(log):
     assert (camera.name, camera.width, camera.height) == (CAMERA.name, 64, 40)
     assert_array_equal(camera.K, CAMERA.K)
     assert_allclose(camera.T_rig_camera, CAMERA.T_rig_camera, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        LensModel("opencv", (-0.25, 0.125, 0.5, -0.5, 0.25, 0.0, 0.0, 1.0, 0.125, 0.0, 0.0, 0.5)),
+        LensModel("fisheye", (0.5, -0.25, 0.125, 0.0), max_angle_rad=1.5),
+        LensModel("ftheta", (0.0, 92.0, -1.5), (), (1.25, 0.5, -0.5), 1.5),
+        LensModel("ftheta", (0.0, 92.0), (0.0, 0.015625), (1.0, 0.0, 0.0), 1.5),
+    ],
+)
+def test_the_lens_of_a_camera_survives(tmp_path, lens):
+    with AslWriter(tmp_path / "a.asl", HEADER) as log:
+        log.begin([replace(CAMERA, lens=lens)])
+        log.actor_poses(T0_US + STEP_US, ego_at(1).T_world_rig, present(T0_US + STEP_US))
+    info = read_asl(tmp_path / "a.asl").info
+    (camera,) = info["cameras"]
+    assert camera.lens == lens
+    middle = np.array([[1.0, 0.0, CAMERA.K[0, 2]], [0.0, 1.0, CAMERA.K[1, 2]], [0.0, 0.0, 1.0]])
+    assert_array_equal(camera.K, middle if lens.kind == "ftheta" else CAMERA.K)
+    assert info["other_cameras"] == ()
+
+
+def test_a_camera_behind_a_windshield_is_named_without_its_lens(tmp_path):
+    with AslWriter(tmp_path / "a.asl", HEADER) as log:
+        log.begin([CAMERA])
+        log.actor_poses(T0_US + STEP_US, ego_at(1).T_world_rig, present(T0_US + STEP_US))
+    entries = list(AslReader(tmp_path / "a.asl"))
+    for entry in entries:
+        for camera in entry.available_cameras_return.available_cameras:
+            camera.intrinsics.bivariate_windshield_model_param.SetInParent()
+    encoded = [entry.SerializeToString() for entry in entries]
+    framed = b"".join(len(entry).to_bytes(4, "big") + entry for entry in encoded)
+    (tmp_path / "b.asl").write_bytes(framed)
+    info = read_asl(tmp_path / "b.asl").info
+    assert (info["cameras"], info["other_cameras"]) == ((), (CAMERA.name,))
 
 
 def test_controller_entries_hold_the_plan_in_its_own_rig_frame(path):

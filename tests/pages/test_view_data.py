@@ -280,7 +280,9 @@ def test_a_camera_says_how_the_road_is_projected_into_its_pictures(small_run):
     cell = cells_of(run)[0]
     drive = cell_data(run, cell, read_logs(run, cell))["drives"][0]
     assert drive["cameras"][0]["lens"] == {
+        "kind": "pinhole",
         "k": [40.0, 40.0, 32.0, 18.0],
+        "scale": 1.0,
         "T": np.eye(4)[:3].ravel().tolist(),
     }
     assert drive["rear"] == round(100 * Vehicle().rear_axle_to_centre_m)

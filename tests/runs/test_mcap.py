@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
+from alpasim_plugin.core.types import LensModel
 from alpasim_plugin.log.asl import AslReader
+from alpasim_plugin.runs.recordings import _camera_items
+from evaluators.pages.images import Source
 from tests.core.checksum_files import vouch_for
 
 mcap_reader = pytest.importorskip("mcap.reader", reason="mcap is not installed: pip install mcap")
@@ -134,6 +138,29 @@ def test_what_is_recorded_is_what_the_log_holds(watched, recorded, renderer):
     assert np.allclose(
         [xyz(point) for point in path["entities"][0]["lines"][0]["points"]], rig.xyz, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ("lens", "stated"),
+    [
+        (None, ("", [])),
+        (
+            LensModel("opencv", (-0.3, 0.1, 0.01, 0.02, 0.05)),
+            ("rational_polynomial", [-0.3, 0.1, 0.01, 0.02, 0.05, 0, 0, 0]),
+        ),
+        (LensModel("fisheye", (0.1, 0.2)), ("kannala_brandt", [0.1, 0.2, 0, 0])),
+        (LensModel("opencv", (0.1, *[0.0] * 7, 0.1)), None),
+        (LensModel("ftheta", (0.0, 90.0)), None),
+    ],
+)
+def test_a_calibration_states_its_lens_or_there_is_none(watched, lens, stated):
+    log = watched.log("clean")
+    camera = replace(log.info["cameras"][0], lens=lens)
+    described = replace(log, info=log.info | {"cameras": (camera,)})
+    items = _camera_items(Source(camera.name, ()), described, "clean")
+    calibrations = [body for _, topic, _, body in items if topic.endswith("/calibration")]
+    models = [(body["distortion_model"], body["D"]) for body in calibrations]
+    assert models == ([] if stated is None else [stated])
 
 
 def test_metrics_have_the_values_of_the_table_and_none_where_they_are_not_valid(watched, recorded):

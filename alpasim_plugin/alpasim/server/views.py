@@ -6,9 +6,8 @@ point per axis and its polynomial by the mean of both factors, as AlpaSim's own 
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +24,8 @@ from alpasim_plugin.cameras.lens import (
 )
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import se3
-from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, LensModel
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec
+from alpasim_plugin.log.schema import read_lens, read_matrix
 from alpasim_plugin.log.wire import common_pb2, sensorsim_pb2
 
 QUAT_NORM_TOLERANCE = 1e-4  # of the squared norm, as AlpaSim checks it
@@ -209,58 +209,9 @@ def camera_of(spec: sensorsim_pb2.CameraSpec, width: int, height: int) -> Camera
             f"{title}: a windshield model",
             "it cannot be rendered here: put a renderer that can behind --upstream",
         )
-    kind = spec.WhichOneof("camera_param")
-    if kind is None or kind not in LENSES:
-        raise InputError(
-            f"{title}: no intrinsics",
-            "fill ftheta_param, opencv_pinhole_param or opencv_fisheye_param",
-        )
-    p = getattr(spec, kind)
-    focal = (1.0, 1.0)
-    if kind != "ftheta_param":
-        focal = p.focal_length_x, p.focal_length_y
-    K = np.array(
-        [
-            [focal[0], 0, p.principal_point_x],
-            [0, focal[1], p.principal_point_y],
-            [0, 0, 1.0],
-        ]
-    )
-    lens = LENSES[kind](p, title)
-    if not (lens or (np.isfinite(K).all() and min(focal) > 0)):
-        raise InputError(f"{title}: focal lengths {focal[0]:.4g}, {focal[1]:.4g}", DO_THIS)
+    lens = read_lens(spec, title)
+    K = read_matrix(spec)
+    if not (lens or (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0)):
+        raise InputError(f"{title}: focal lengths {K[0, 0]:.4g}, {K[1, 1]:.4g}", DO_THIS)
     size = spec.resolution_w, spec.resolution_h
     return resized(CameraSpec(spec.logical_id, *size, K, np.eye(4), lens=lens), width, height)
-
-
-def _opencv(p: Any, title: str) -> LensModel | None:
-    lengths = (p.radial_coeffs, 6), (p.tangential_coeffs, 2), (p.thin_prism_coeffs, 4)
-    if any(len(coefficients) > n for coefficients, n in lengths):
-        raise InputError(f"{title}: more coefficients than k1..k6, p1, p2, s1..s4", DO_THIS)
-    k, t, s = ((*coefficients, *[0.0] * (n - len(coefficients))) for coefficients, n in lengths)
-    if not any((*k, *t, *s)):
-        return None
-    return LensModel("opencv", (*k[:2], *t, *k[2:], *s))
-
-
-def _fisheye(p: Any, title: str) -> LensModel:
-    return LensModel("fisheye", tuple(p.radial_coeffs), max_angle_rad=p.max_angle)
-
-
-def _ftheta(p: Any, title: str) -> LensModel:
-    forward = tuple(p.angle_to_pixeldist_poly)
-    backward = tuple(p.pixeldist_to_angle_poly)
-    linear = (1.0, 0.0, 0.0)
-    if p.HasField("linear_cde"):
-        linear = p.linear_cde.linear_c, p.linear_cde.linear_d, p.linear_cde.linear_e
-    goes_back = p.reference_poly == sensorsim_pb2.FthetaCameraParam.PIXELDIST_TO_ANGLE
-    if goes_back or not forward:
-        return LensModel("ftheta", forward, backward, linear, p.max_angle)
-    return LensModel("ftheta", forward, (), linear, p.max_angle)
-
-
-LENSES: Mapping[str, Callable[[Any, str], LensModel | None]] = {
-    "opencv_pinhole_param": _opencv,
-    "opencv_fisheye_param": _fisheye,
-    "ftheta_param": _ftheta,
-}

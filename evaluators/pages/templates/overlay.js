@@ -1,10 +1,11 @@
 "use strict";
 // Lines on the road and boxes of road users, projected into a camera image. The ground is the plane on which the ego stands.
 
-const NEAR_M = 0.4, REACH_CM = 9000;
+const REACH_CM = 9000, PIECE_RAD = 0.03, CUTS = 24;
+const between = (p, q, share) => p.map((v, k) => v + share * (q[k] - v));
 
 class Overlay {
-  // lens: {k: [fx, fy, cx, cy] in pixels of the image, T: rig from camera, 3 rows of 4}; rear: from the rear axle to the box centre, cm.
+  // lens: as lens.js reads it, with T: rig from camera, 3 rows of 4; rear: from the rear axle to the box centre, cm.
   constructor(context, lens, rear) {
     Object.assign(this, { context, lens, rear });
   }
@@ -21,18 +22,39 @@ class Overlay {
     return [0, 1, 2].map((k) => T[k] * p[0] + T[4 + k] * p[1] + T[8 + k] * p[2]);
   }
 
-  pixel([x, y, z]) { const [fx, fy, cx, cy] = this.lens.k; return [(fx * x) / z + cx, (fy * y) / z + cy]; }
-
-  // Add a segment to the path, cut where it passes behind the camera.
+  // Add a segment to the path, as far as the camera shows it: through a pinhole straight, through another lens in short pieces.
   segment(p, q) {
+    if (this.lens.kind !== "pinhole") { this.curve(p, q); return; }
     if (p[2] < NEAR_M && q[2] < NEAR_M) return;
-    const cut = (one, other) => {
-      if (one[2] >= NEAR_M) return one;
-      const f = (NEAR_M - one[2]) / (other[2] - one[2]);
-      return one.map((v, k) => v + f * (other[k] - v));
-    };
-    this.context.moveTo(...this.pixel(cut(p, q)));
-    this.context.lineTo(...this.pixel(cut(q, p)));
+    const cut = (one, other) => (one[2] >= NEAR_M ? one : between(one, other, (NEAR_M - one[2]) / (other[2] - one[2])));
+    this.context.moveTo(...pixelOf(this.lens, cut(p, q)));
+    this.context.lineTo(...pixelOf(this.lens, cut(q, p)));
+  }
+
+  // Pieces that the camera sees under equal angles; one that the lens shows in part is cut where it ends.
+  curve(p, q) {
+    const far = Math.hypot(...p), away = Math.hypot(...q), cross = Math.hypot(p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]);
+    const whole = Math.atan2(cross, p[0] * q[0] + p[1] * q[1] + p[2] * q[2]), count = Math.max(1, Math.ceil(whole / PIECE_RAD));
+    let before = p, shown = pixelOf(this.lens, p);
+    if (shown) this.context.moveTo(...shown);
+    for (let k = 1; k <= count; k += 1) {
+      const a = (whole * k) / count, here = far * Math.sin(a), there = away * Math.sin(whole - a);
+      const point = k === count ? q : between(p, q, here / (here + there)), pixel = pixelOf(this.lens, point);
+      if (shown && pixel) this.context.lineTo(...pixel);
+      else if (shown) this.context.lineTo(...this.lastShown(before, point));
+      else if (pixel) { this.context.moveTo(...this.lastShown(point, before)); this.context.lineTo(...pixel); }
+      [before, shown] = [point, pixel];
+    }
+  }
+
+  // The last pixel on the way from a point that the lens shows to one that it does not.
+  lastShown(from, to) {
+    let [low, high] = [0, 1];
+    for (let k = 0; k < CUTS; k += 1) {
+      const middle = (low + high) / 2;
+      if (pixelOf(this.lens, between(from, to, middle))) low = middle; else high = middle;
+    }
+    return pixelOf(this.lens, between(from, to, low));
   }
 
   line([xs, ys], close = false) {
@@ -62,10 +84,10 @@ class Overlay {
     const { context } = this;
     context.fillStyle = colour;
     for (let k = 2; k < line[0].length; k += 2) {
-      const p = this.camera(line[0][k], line[1][k]);
-      if (p[2] < NEAR_M) continue;
+      const pixel = pixelOf(this.lens, this.camera(line[0][k], line[1][k]));
+      if (!pixel) continue;
       context.beginPath();
-      context.arc(...this.pixel(p), 4, 0, 7);
+      context.arc(...pixel, 4, 0, 7);
       context.fill();
     }
   }
