@@ -27,10 +27,10 @@ from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, heading_of, se2, transform_points
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
+from scenarios.light_posts import Carriageway
 from scenarios.map_lines import is_left_of, rails
 from scenarios.map_route import Spot
 from scenarios.opendrive import T_enu_earth, earth_xyz
-from scenarios.opendrive_signals import LOWEST_HEAD_M
 from scenarios.recorded import SourceFiles, near
 from scenarios.street_map import Head, StreetMap
 
@@ -309,7 +309,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         stations = {name: s_m, f"-{name}": lengths[name] - s_m}
         return [Spot(key, at_m) for key, at_m in stations.items() if key in lanes]
 
-    heads = _heads(osm, lanes)
+    heads, posts = _with_posts(_heads(osm, lanes), Carriageway(lanes))
     notes = [*_lane_notes(lanelets, lanes), *_rule_notes(osm, unread)]
     return StreetMap(
         lanes,
@@ -317,7 +317,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
             {},
             crosswalks=tuple(lanelets.crosswalks),
             stop_lines=tuple(osm.line(osm.nodes(way)) for way in osm.ways("stop_line")),
-            poles=tuple(_post(head.signal) for head in heads if head.signal.head is not None),
+            poles=posts,
             signs=tuple(_sign(osm, way) for way in osm.ways("traffic_sign")),
         ),
         heads,
@@ -570,7 +570,7 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
         (line, replace(stop, head=head))
         for (line, ref), keys in held.items()
         for stop in [_stop(osm, line, ref, [lanes[key] for key in keys])]
-        for head in _lamps(osm, osm.rules[ref], stop)
+        for head in _lamps(osm, osm.rules[ref])
     ]
     if not signals:
         return ()
@@ -583,7 +583,7 @@ def _heads(osm: Osm, lanes: Mapping[str, Lane]) -> tuple[Head, ...]:
     )
 
 
-def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64 | None]:
+def _lamps(osm: Osm, rule: Item) -> list[F64 | None]:
     """Return the middle of the lamps of each light of an element: a way is their lower edge, in
     maps without heights on the ground; None alone where the element names no light.
     """
@@ -592,7 +592,6 @@ def _lamps(osm: Osm, rule: Item, stop: Signal) -> list[F64 | None]:
         middle = osm.line(osm.nodes(way)).mean(axis=0)
         with parsing(f"{osm.path}, way {way}, height", "give a number of metres"):
             middle[2] += float(osm.items["way"][way].tags.get("height", LAMPS_M)) / 2
-        middle[2] = max(middle[2], float(stop.stop[:, 2].mean()) + LOWEST_HEAD_M)
         middles.append(middle)
     return middles or [None]
 
@@ -618,12 +617,21 @@ def _stop(osm: Osm, line: str, name: str, lanes: Sequence[Lane]) -> Signal:
     return Signal(ends, heading_rad, (), 0, name, tuple(lane.lane_id for lane in lanes))
 
 
-def _post(signal: Signal) -> F64:
-    """Return the post ``(2, 3)`` that the lamps of a light stand on."""
-    assert signal.head is not None
-    foot = signal.head.copy()
-    foot[2] = signal.stop[:, 2].mean()
-    return np.stack([foot, signal.head])
+def _with_posts(
+    heads: Sequence[Head], carriageway: Carriageway
+) -> tuple[tuple[Head, ...], tuple[F64, ...]]:
+    """Return lights with the places of their lamps on posts, and the posts ``(N, 3)``."""
+    placed_heads = []
+    posts = []
+    for head in heads:
+        lamps = head.signal.head
+        if lamps is not None:
+            foot = np.array([*lamps[:2], head.signal.stop[:, 2].mean()])
+            post = carriageway.post(foot, float(lamps[2] - foot[2]))
+            posts.append(post.line)
+            lamps = post.lamps
+        placed_heads.append(replace(head, signal=replace(head.signal, head=lamps)))
+    return tuple(placed_heads), tuple(posts)
 
 
 def _sign(osm: Osm, way: str) -> tuple[F64, Box]:

@@ -21,6 +21,7 @@ from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.files.limits import LATERAL_OFFSET_M
 from alpasim_plugin.core.geometry import densify, project, rigid, shifted
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType
+from scenarios.junction_marks import Side, with_open_junctions
 from scenarios.map_lines import bordered
 from scenarios.map_route import Spot
 from scenarios.opendrive_road import (
@@ -30,6 +31,7 @@ from scenarios.opendrive_road import (
     OdrLane,
     OdrMap,
     Road,
+    RoadMark,
     Section,
     cubics_at,
     driven_along,
@@ -349,7 +351,7 @@ def read_lanes(
         raise InputError(
             f"{location}: a map without a lane for vehicles", "use a map with lanes of type driving"
         )
-    linked, link_notes = following(odr, lanes)
+    linked, link_notes = following(odr, _open_junctions(odr, lanes))
     notes = [f"lanes of type {kind} left out: {n}" for kind, n in sorted(left_out.items())]
     if changing:
         notes.append(
@@ -471,8 +473,6 @@ def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequ
     k = side.index(lane)
     inside = side[k - 1] if k > 0 else None
     outside = side[k + 1] if k + 1 < len(side) else None
-    marks = {other.lane_id: other.mark for other in section.lanes}
-    inner_mark = marks.get(inside.lane_id if inside is not None else 0)
 
     def key_of(neighbour: OdrLane | None) -> str | None:
         is_same_way = neighbour is not None and neighbour.reversed == lane.reversed
@@ -483,7 +483,7 @@ def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequ
     # Seen in driving direction the middle of the road is on the left, with left-hand traffic on
     # the right.
     order = -1 if road.left_hand != lane.reversed else 1
-    left_mark_type, right_mark_type = (_mark_type(inner_mark), _mark_type(lane.mark))[::order]
+    left_mark, right_mark = _marks(road, section, lane)
     left_id, right_id = (key_of(inside), key_of(outside))[::order]
     turn = 1 if driven_along(road, lane) else -1
     left, right = (edge[::turn] for edge in borders[::order])
@@ -497,11 +497,48 @@ def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequ
         "bus" if lane.closed and kind == "vehicle" else kind,
         left_neighbour=left_id,
         right_neighbour=right_id,
-        left_mark_type=left_mark_type,
-        right_mark_type=right_mark_type,
+        left_mark_type=_mark_type(left_mark),
+        right_mark_type=_mark_type(right_mark),
         is_intersection=road.junction != "-1",
         speed_limit_mps=min(limits, default=None),
     )
+
+
+def _marks(road: Road, section: Section, lane: OdrLane) -> tuple[RoadMark | None, RoadMark | None]:
+    """Return the marks on the left and on the right of a lane in driving direction."""
+    side = section.side(1 if lane.lane_id > 0 else -1)
+    k = side.index(lane)
+    marks = {other.lane_id: other.mark for other in section.lanes}
+    inner_mark = marks.get(side[k - 1].lane_id if k > 0 else 0)
+    if road.left_hand != lane.reversed:
+        return lane.mark, inner_mark
+    return inner_mark, lane.mark
+
+
+def _guides(roads: Sequence[Road]) -> set[Side]:
+    """Return the sides of lanes in junctions whose line the map gives piece by piece."""
+    guides = set()
+    for road in roads:
+        for index, section in enumerate(road.sections):
+            for lane in (lane for lane in section.lanes if lane.lane_id != 0):
+                key = lane_key(road, index, lane.lane_id)
+                for side, mark in zip(("left", "right"), _marks(road, section, lane), strict=True):
+                    if mark is not None and mark.explicit:
+                        guides.add((key, side))
+    return guides
+
+
+def _open_junctions(odr: OdrMap, lanes: Mapping[str, Lane]) -> dict[str, Lane]:
+    """Return lanes without the markings over which other lanes of their junction lead."""
+    roads = [road for road in odr.roads if road.junction != "-1"]
+    junctions = {
+        key: road.junction
+        for road in roads
+        for index, section in enumerate(road.sections)
+        for lane in section.lanes
+        if (key := lane_key(road, index, lane.lane_id)) in lanes
+    }
+    return with_open_junctions(lanes, junctions, _guides(roads))
 
 
 def _stations(road: Road, section: Section) -> F64:
@@ -546,11 +583,11 @@ def _divided(knots: F64, parts: F64) -> F64:
     return np.concatenate([*divided, knots[-1:]])
 
 
-def _mark_type(mark: tuple[str, str] | None) -> LaneMarkType:
+def _mark_type(mark: RoadMark | None) -> LaneMarkType:
     """Return the kind of a road mark; colours other than yellow are white."""
-    if mark is None or mark[0] == "none":
+    if mark is None or mark.kind == "none":
         return "none"
-    kind, colour = mark
+    kind, colour = mark.kind, mark.colour
     if kind in _SOLID:
         return (
             ("double_yellow" if " " in kind else "solid_yellow")

@@ -155,6 +155,15 @@ Limit = tuple[float, float | None]  # from a place on, metres: speed limit in m/
 
 
 @dataclass(frozen=True)
+class RoadMark:
+    """A line along the outer border of a lane."""
+
+    kind: str
+    colour: str
+    explicit: bool  # the map gives its pieces by themselves, as where it leads through a junction
+
+
+@dataclass(frozen=True)
 class OdrLane:
     """A lane of one section. ``widths`` and ``borders`` count s from the road's start."""
 
@@ -164,7 +173,7 @@ class OdrLane:
     borders: F64
     successors: tuple[int, ...]
     predecessors: tuple[int, ...]
-    mark: tuple[str, str] | None  # type and colour of the first road mark of its outer border
+    mark: RoadMark | None  # the first one of its outer border
     reversed: bool = False  # driven against the usual direction of its side
     level: bool = False  # it and the lanes outside of it are not banked with the road
     limits: tuple[Limit, ...] = ()  # of its own, which go before those of the road
@@ -212,6 +221,7 @@ class RoadSignal:
     width_m: float
     height_m: float
     lanes: tuple[tuple[int, int], ...] = ()  # ranges of lanes that it is for; none: all
+    by_reference: bool = False  # it stands where another road has it
 
     def holds(self, lane_id: int) -> bool:
         """Return whether it is for a lane, its direction apart."""
@@ -558,33 +568,41 @@ def _is_reversed(lane: Element, left_hand: bool) -> bool:
     return directions != {"forward" if is_usually_forward else "backward"}
 
 
+def _lane(lane: Element, section_m: float, left_hand: bool) -> OdrLane:
+    """Return a lane of a section that starts at ``section_m`` of its road."""
+    return OdrLane(
+        int(lane.get("id", "")),
+        lane.get("type", "none"),
+        _cubics(lane, "width", "sOffset", section_m),
+        _cubics(lane, "border", "sOffset", section_m),
+        tuple(int(link.get("id", "")) for link in lane.findall("link/successor")),
+        tuple(int(link.get("id", "")) for link in lane.findall("link/predecessor")),
+        _mark(lane.find("roadMark")),
+        _is_reversed(lane, left_hand),
+        lane.get("level") == "true",
+        tuple(
+            (section_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
+            for limit in lane.findall("speed")
+            if not _is_zero(limit)
+        ),
+        _closed_to_cars(lane),
+    )
+
+
 def _section(element: Element, start_m: float, end_m: float, left_hand: bool) -> Section:
-    lanes = []
-    for side in ("left", "center", "right"):
-        for lane in element.findall(f"{side}/lane"):
-            mark = lane.find("roadMark")
-            lanes.append(
-                OdrLane(
-                    int(lane.get("id", "")),
-                    lane.get("type", "none"),
-                    _cubics(lane, "width", "sOffset", start_m),
-                    _cubics(lane, "border", "sOffset", start_m),
-                    tuple(int(link.get("id", "")) for link in lane.findall("link/successor")),
-                    tuple(int(link.get("id", "")) for link in lane.findall("link/predecessor")),
-                    None
-                    if mark is None
-                    else (mark.get("type", "none"), mark.get("color", "standard")),
-                    _is_reversed(lane, left_hand),
-                    lane.get("level") == "true",
-                    tuple(
-                        (start_m + _number(limit, "sOffset", 0.0), _limit_mps(limit))
-                        for limit in lane.findall("speed")
-                        if not _is_zero(limit)
-                    ),
-                    _closed_to_cars(lane),
-                )
-            )
+    lanes = [
+        _lane(lane, start_m, left_hand)
+        for side in ("left", "center", "right")
+        for lane in element.findall(f"{side}/lane")
+    ]
     return Section(start_m, end_m, tuple(lanes))
+
+
+def _mark(element: Element | None) -> RoadMark | None:
+    if element is None:
+        return None
+    is_explicit = element.find("explicit") is not None
+    return RoadMark(element.get("type", "none"), element.get("color", "standard"), is_explicit)
 
 
 def _cubics(owner: Element, place: str, start_key: str = "s", start_m: float = 0.0) -> F64:
@@ -615,6 +633,7 @@ def _signal(place: Element, nature: Element) -> RoadSignal:
         _number(nature, "width", 0.0),
         _number(nature, "height", 0.0),
         tuple((min(ends), max(ends)) for ends in lanes),
+        place is not nature,
     )
 
 

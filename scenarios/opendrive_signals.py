@@ -12,6 +12,7 @@ import numpy as np
 from alpasim_plugin.core.files import some_of
 from alpasim_plugin.core.geometry import direction_of, heading_of, se2
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, Signal
+from scenarios.light_posts import Carriageway, Post
 from scenarios.opendrive_road import (
     CROSSWALK,
     CROSSWALK_M,
@@ -29,18 +30,16 @@ from scenarios.street_map import Head
 PEDESTRIAN_LIGHT = "1000002"
 GIVE_WAY = ("205", "206")  # give way; stop
 STOP_REACH_M = 25.0  # a light is waited for at a stop line that is no farther away than this
-LOWEST_HEAD_M = 3.0  # of the middle of the lamps above the road, where the map has them lower
 OPEN_ROAD = "on road "  # and its name: of a light whose road leads to no junction
 PLATE_M = 0.1  # what is lower than this is painted on the road
 
 
 def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMap:
-    """Return a map without lanes: the crosswalks, stop lines, signs and posts of the roads of
-    ``lanes``.
+    """Return a map without lanes: the crosswalks, stop lines, signs and posts of lights of the roads
+    of ``lanes``.
     """
     crosswalks = []
     stop_lines = []
-    poles = []
     signs = []
     for road in _roads(odr, lanes):
         crosswalks += [placed(road, ring, T_local_map) for ring in road.crosswalks]
@@ -55,11 +54,7 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
                     for direction_lanes in held
                     if direction_lanes
                 ]
-            elif signal.dynamic:
-                foot = placed(road, np.array([[signal.s_m, signal.t_m]]), T_local_map)
-                top = foot + np.array([0.0, 0.0, max(signal.above_m + signal.height_m, 2.0)])
-                poles.append(np.concatenate([foot, top]))
-            elif signal.kind != CROSSWALK and signal.height_m > PLATE_M:
+            elif not signal.dynamic and signal.kind != CROSSWALK and signal.height_m > PLATE_M:
                 heading = _heading_rad(
                     road, signal.s_m, (*_senses(road, signal), True)[0], T_local_map
                 )
@@ -72,7 +67,7 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
         {},
         crosswalks=tuple(crosswalks),
         stop_lines=tuple(stop_lines),
-        poles=tuple(poles),
+        poles=tuple(post.line for post in light_posts(odr, lanes, T_local_map).values()),
         signs=tuple(signs),
     )
 
@@ -90,9 +85,13 @@ def traffic_lights(
     """
     heads = []
     loose: dict[str, None] = {}
+    posts = light_posts(odr, lanes, T_local_map)
     for road in _roads(odr, lanes):
         for light in (signal for signal in road.signals if signal.dynamic):
-            light_heads = _heads(road, light, odr.controllers, lanes, T_local_map)
+            light_heads = [
+                replace(head, signal=replace(head.signal, head=posts[light.signal_id].lamps))
+                for head in _heads(road, light, odr.controllers, lanes, T_local_map)
+            ]
             heads += light_heads
             loose |= {} if light_heads else {light.signal_id: None}
     holding = {head.signal.name for head in heads}
@@ -116,6 +115,21 @@ def give_way_lines(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> 
         if signal.kind in GIVE_WAY
         for head in _heads(road, signal, odr.controllers, lanes, T_local_map)
     )
+
+
+def light_posts(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> dict[str, Post]:
+    """Return the post of every traffic light. It stands once, where the map writes the light: what
+    other roads say of it by reference is whom it holds.
+    """
+    surface = Carriageway(lanes)
+    posts = {}
+    for road in odr.roads:
+        for light in (signal for signal in road.signals if signal.dynamic):
+            if not light.by_reference and road.records:
+                foot = placed(road, np.array([[light.s_m, light.t_m]]), T_local_map)[0]
+                lamps_m = light.above_m + light.height_m / 2
+                posts[light.signal_id] = surface.post(foot, lamps_m)
+    return posts
 
 
 def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:
@@ -158,9 +172,6 @@ def _heads(
                 ends, _heading_rad(road, s_m, along, T_local_map), (), 0, light.signal_id,
                 tuple(key for key, _, _ in held),
             )  # fmt: skip
-        place = placed(road, np.array([[light.s_m, light.t_m]]), T_local_map)[0]
-        place[2] += max(light.above_m + light.height_m / 2, LOWEST_HEAD_M)
-        signal = replace(signal, head=place)
         group = controllers.get(light.signal_id, "")
         heads.append(Head(signal, junction, group, road.road_id))
     return heads

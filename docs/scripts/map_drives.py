@@ -1,29 +1,38 @@
 """Drive policies along drawn routes of maps among reactive vehicles, and print how the drives ended
 and what happened among the other road users.
 
-Usage: python docs/scripts/map_drives.py FOLDER MAP... [--policies P,P] [--routes N] [--length M]; it
-continues when it is interrupted. The seeds of the routes are 0 to N - 1.
+Usage: python docs/scripts/map_drives.py FOLDER MAP... [--policies P,P] [--routes N] [--length M]
+[--lights]; it continues when it is interrupted. The seeds of the routes are 0, 1, ...; with
+``--lights`` those whose route passes no traffic light are left out.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import shapely
 from pages import table
 
-from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.geometry import rectangle_corners, yaw_from_quat
-from alpasim_plugin.core.types import Actor, RolloutLog
-from alpasim_plugin.log import read_asl
-from alpasim_plugin.log.run_folder.reader import Run
-from alpasim_plugin.log.run_folder.schema import LOG_NAME
+from alpasim_plugin.core.types import Actor, RolloutLog, Scenario
+from alpasim_plugin.log.run_folder.rows import Rollout
+from alpasim_plugin.runs.renderer import make_renderer
+from alpasim_plugin.runs.rollout import run_rollout
+from alpasim_plugin.runs.scoring import tabulate
+from alpasim_plugin.world.path import smooth_path, thinned
+from alpasim_plugin.world.signals import lights_on
+from evaluators import score
 from evaluators.metrics.outcomes import ending_of
+from policies.base import make_policy
+from scenarios.load import load_scenario
 
-POLICIES = "rule-based,pure-pursuit,constant-velocity,log-replay"
+POLICIES = "rule-based,log-replay,pure-pursuit,constant-velocity,lane-camera,learned"
+PRESET = "strict"
 SCENE = """version: 1
 seed: {seed}
 map: {{opendrive: {path}, route: {{length_m: {length_m:g}}}, vehicles: 8}}
@@ -31,41 +40,87 @@ map: {{opendrive: {path}, route: {{length_m: {length_m:g}}}, vehicles: 8}}
 LEVEL_M = 2.0  # boxes whose middles are farther apart in height do not touch
 JUMP_MPS2 = 12.0  # what no tyre gives
 STANDS_MPS = 0.1
+AT_LINE_M = 8.0  # from the middle of the ego to the line of a light that it has just passed
+CYCLES = 2  # of a light, for which a road user may stand
 
 
 @dataclass(frozen=True)
-class Traffic:
-    """What happened among the other road users of one rollout.
+class Drive:
+    """How one drive ended, and what happened around it.
 
     Attributes:
-        vehicles: How many there were.
-        contacts: Pairs that touch at some step.
-        jumps: Road users whose speed changes at some step by more than tyres can.
-        longest_stand_s: The longest time that one stands.
+        ending: In the words of the run's tables.
+        drive_s, expert_s: How long the policy and the expert drove, seconds.
+        ran_red: Whether it ran a red light.
+        false_red: Whether no red light held the lane where it is said to have run one.
+        vehicles: How many other road users there were.
+        contacts: Pairs of them that touch at some step.
+        jumps: Those whose speed changes at some step by more than tyres can.
+        longest_stand_s: The longest time that a vehicle among them stands, seconds.
+        cycle_s: The longest cycle of the lights, seconds; 0 without lights.
     """
 
+    ending: str
+    drive_s: float
+    expert_s: float
+    ran_red: bool
+    false_red: bool
     vehicles: int
     contacts: int
     jumps: int
     longest_stand_s: float
+    cycle_s: float
 
-    @classmethod
-    def of(cls, log: RolloutLog) -> Traffic:
-        """Look at every step of a log."""
-        actors = list(log.actors.values())
-        pairs = [
-            (first, second)
-            for number, first in enumerate(actors)
-            for second in actors[number + 1 :]
-            if touch(first, second)
-        ]
-        moves = [(actor, speeds(actor)) for actor in actors if len(actor.track) > 2]
-        return cls(
-            len(actors),
-            len(pairs),
-            sum(hardest_mps2(actor, speed_mps) > JUMP_MPS2 for actor, speed_mps in moves),
-            max((longest_stand_s(actor, speed_mps) for actor, speed_mps in moves), default=0.0),
-        )
+    @property
+    def stands_too_long(self) -> bool:
+        """Tell whether a vehicle stood for longer than `CYCLES` of the lights."""
+        return self.cycle_s > 0 and self.longest_stand_s > CYCLES * self.cycle_s
+
+
+def drive(scenario: Scenario, policy: str) -> Drive:
+    """Drive a scene once with a policy, and look at every step of the log."""
+    renderer = make_renderer("clean", scenario)
+    recorder = run_rollout(scenario, renderer, make_policy(policy, scenario))
+    log = recorder.log(images=False)
+    _, scores = tabulate(log, score(log, scenario.scene, PRESET), PRESET)
+    values = {name: metric.value for name, metric in scores.metrics.items() if metric.valid}
+    rollout = Rollout("clean", policy, scenario.scene_id, 0, "ok", metrics=values)
+    reds_us = [event.t_us for event in scores.events if event.metric == "red_light"]
+    actors = list(log.actors.values())
+    pairs = [
+        (first, second)
+        for number, first in enumerate(actors)
+        for second in actors[number + 1 :]
+        if touch(first, second)
+    ]
+    moves = [(actor, speeds(actor)) for actor in actors if len(actor.track) > 2]
+    signals = scenario.lane_map.signals or ()
+    return Drive(
+        ending_of(rollout),
+        (log.ego.t_us[-1] - log.ego.t_us[0]) * 1e-6,
+        (log.ego_log.t_us[-1] - log.ego_log.t_us[0]) * 1e-6,
+        len(reds_us) > 0,
+        not all(is_held(scenario, log, t_us) for t_us in reds_us),
+        len(actors),
+        len(pairs),
+        sum(hardest_mps2(actor, speed_mps) > JUMP_MPS2 for actor, speed_mps in moves),
+        max(
+            (longest_stand_s(*move) for move in moves if move[0].label != "pedestrian"), default=0.0
+        ),
+        max((sum(us for _, us in signal.phases) * 1e-6 for signal in signals), default=0.0),
+    )
+
+
+def is_held(scenario: Scenario, log: RolloutLog, t_us: int) -> bool:
+    """Return whether a red light at which the ego is holds a lane of its route."""
+    row = int(np.searchsorted(log.ego.t_us, t_us))
+    place = shapely.Point(log.ego.xyz[row, :2])
+    return any(
+        signal.colour_at(t_us) != "green"
+        and not set(signal.lanes).isdisjoint(scenario.route.lane_ids)
+        and shapely.LineString(signal.stop[:, :2]).distance(place) < AT_LINE_M
+        for signal in scenario.lane_map.signals or ()
+    )
 
 
 def touch(first: Actor, second: Actor) -> bool:
@@ -106,41 +161,71 @@ def longest_stand_s(actor: Actor, speed_mps: np.ndarray) -> float:
     return longest_s
 
 
-def drive(folder: Path, path: Path, options: argparse.Namespace) -> Run:
-    """Drive the routes of one map with every policy."""
-    scenes = folder / "scenes" / path.stem
+def scenes_of(folder: Path, path: Path, options: argparse.Namespace) -> Iterator[Path]:
+    """Write the scenes of a map, and yield as many as are wanted, by rising seed."""
+    scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
-    for seed in range(options.routes):
+    seed = wanted = 0
+    while wanted < options.routes:
+        scene = scenes / f"{path.stem.lower()}_{seed}.yaml"
         text = SCENE.format(seed=seed, path=path.resolve(), length_m=options.length)
-        (scenes / f"{path.stem.lower()}_{seed}.yaml").write_text(text, encoding="utf-8")
-    out = folder / path.stem
-    kept = ["--video", "none", "--images", "none", "--no-report", "-j", "1"]
-    variants = ["--renderer", "clean", "--policy", options.policies, "--seeds", "1"]
-    run_command([*variants, *kept, str(scenes), "--out", str(out)])
-    return Run.read_so_far(out)
+        scene.write_text(text, encoding="utf-8")
+        if not options.lights or passes_light(scene):
+            wanted += 1
+            yield scene
+        seed += 1
 
 
-def row_of(run: Run, name: str, policy: str) -> list[str]:
+def passes_light(scene: Path) -> bool:
+    """Return whether the route of a scene passes a traffic light before its goal."""
+    answer = scene.with_suffix(".light.json")
+    if not answer.exists():
+        scenario = load_scenario(scene)
+        lane_map = scenario.lane_map
+        line = scenario.ego_log.xyz
+        path = smooth_path(line[thinned(line, 1.0)])
+        lights = lights_on(path, lane_map.signals, lane_map.lanes)
+        answer.write_text(json.dumps(len(lights) > 0), encoding="utf-8")
+    return bool(json.loads(answer.read_text(encoding="utf-8")))
+
+
+def drives_of(folder: Path, path: Path, options: argparse.Namespace) -> dict[str, list[Drive]]:
+    """Drive the routes of one map with every policy; drives of before are read back."""
+    drives: dict[str, list[Drive]] = {policy: [] for policy in options.policies.split(",")}
+    for scene in scenes_of(folder, path, options):
+        scenario = None
+        for policy, done in drives.items():
+            record = folder / "drives" / f"{scene.stem}-{policy}.json"
+            if not record.exists():
+                scenario = scenario or load_scenario(scene)
+                record.parent.mkdir(exist_ok=True)
+                record.write_text(json.dumps(asdict(drive(scenario, policy))), encoding="utf-8")
+            done.append(Drive(**json.loads(record.read_text(encoding="utf-8"))))
+            print(record.stem, done[-1], flush=True)
+    return drives
+
+
+def row_of(name: str, policy: str, drives: list[Drive]) -> list[str]:
     """Return a row of the table: one map, one policy."""
-    rollouts = [rollout for rollout in run.rollouts if rollout.policy == policy]
-    endings = [ending_of(rollout) for rollout in rollouts]
-    lights = [rollout.metrics.get("red_light") for rollout in rollouts]
-    files = [run.file_of(rollout, LOG_NAME) for rollout in rollouts]
-    traffic = [Traffic.of(read_asl(file)) for file in files if file is not None]
-    counted = ", ".join(f"{endings.count(kind)} {kind}" for kind in dict.fromkeys(endings))
+    endings = [part.ending for part in drives]
     return [
         name,
         f"`{policy}`",
-        counted,
-        f"{sum(1 for value in lights if value)} of {len(lights)}",
-        str(sum(part.vehicles for part in traffic)),
-        str(sum(part.contacts for part in traffic)),
-        str(sum(part.jumps for part in traffic)),
-        f"{max((part.longest_stand_s for part in traffic), default=0.0):.0f}",
+        ", ".join(f"{endings.count(kind)} {kind}" for kind in dict.fromkeys(endings)),
+        f"{sum(part.ran_red for part in drives)} of {len(drives)}",
+        str(sum(part.false_red for part in drives)),
+        str(sum(part.vehicles for part in drives)),
+        str(sum(part.contacts for part in drives)),
+        str(sum(part.jumps for part in drives)),
+        f"{max(part.longest_stand_s for part in drives):.0f}",
+        str(sum(part.stands_too_long for part in drives)),
     ]
 
 
-HEAD = ["map", "policy", "ended", "red light", "road users", "contacts", "jumps", "stood, s"]
+HEAD = [
+    "map", "policy", "drives that ended", "`red_light`", "of them false", "other road users",
+    "pairs in contact", "jumps", "longest wait, s", "longer than two cycles",
+]  # fmt: skip
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
@@ -149,9 +234,10 @@ if __name__ == "__main__":
     parser.add_argument("--policies", default=POLICIES)
     parser.add_argument("--routes", type=int, default=12)
     parser.add_argument("--length", type=float, default=300.0)
+    parser.add_argument("--lights", action="store_true")
     chosen = parser.parse_args()
     lines = []
     for file in chosen.maps:
-        driven = drive(chosen.folder, file, chosen)
-        lines += [row_of(driven, file.stem, policy) for policy in chosen.policies.split(",")]
+        driven = drives_of(chosen.folder, file, chosen)
+        lines += [row_of(file.stem, policy, drives) for policy, drives in driven.items()]
     print(table(HEAD, lines))

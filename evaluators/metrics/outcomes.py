@@ -358,6 +358,7 @@ def actor_ahead(
     if len(steps) == 0 or len(actors) == 0 or len(line) < 2:
         return out
     way = shapely.linestrings(line)
+    shapely.prepare(way)
     ego_xy = rollout.ego.xyz[steps, :2] - origin[:2]
     s = s[steps]
     reach_m = reach_m[steps]
@@ -368,13 +369,12 @@ def actor_ahead(
             & (actors_at.centre_distance_m(ego_xy) < reach_m + actors.radius_m[:, None])
         )
         boxes = actors_at.footprints(actor, step)
+        beside = shapely.dwithin(way, boxes.shapes(), rollout.ego_box.width_m / 2 + BESIDE_M)
+        step = step[beside]
+        boxes = boxes.take(np.flatnonzero(beside))
         corners = to_path(line, boxes.corners().reshape(-1, 2))[1].reshape(-1, 4)
         gap_m = corners.max(axis=1) - s[step]
         near = (gap_m > 0.0) & (gap_m < reach_m[step] + boxes.size[:, 0])
-        near[near] = (
-            shapely.distance(boxes.take(np.flatnonzero(near)).shapes(), way)
-            < rollout.ego_box.width_m / 2 + BESIDE_M
-        )
         out[step[near]] = True
     return out
 

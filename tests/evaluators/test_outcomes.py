@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
 from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
@@ -13,8 +14,10 @@ from alpasim_plugin.log.run_folder.rows import Rollout, rollouts_of_table
 from alpasim_plugin.log.run_folder.writer import rollout_table
 from alpasim_plugin.runs.scoring import tabulate
 from evaluators import reduce_rollout, score
+from evaluators.metrics.footprint import origin_of
 from evaluators.metrics.outcomes import (
     OUTCOMES,
+    actor_ahead,
     evaluate_outcomes,
     first_failure,
     in_words,
@@ -123,6 +126,49 @@ def test_a_long_body_across_the_road_is_a_cause_although_no_corner_is_on_the_pat
     assert not any(
         bool(np.any(one.value > 0)) for one in evaluate_outcomes(log, scene, PRESETS["paper"])
     )
+
+
+def seen_ahead(log, line, s, reach_m):
+    """Say step by step, with each road user by itself, what `actor_ahead` says of all at once."""
+    way = shapely.LineString(line)
+    half = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [4.5 / 2, 1.8 / 2]
+    out = []
+    for step, (t_us, place, reach) in enumerate(zip(log.ego.t_us, s, reach_m, strict=True)):
+        seen = False
+        for actor in log.actors.values():
+            for soon_us in (0, 1_000_000, 2_000_000):
+                row = np.flatnonzero(actor.track.t_us == t_us + soon_us)
+                if len(row):
+                    middle = actor.track.xyz[row[0], :2]
+                    away_m = np.hypot(*(middle - log.ego.xyz[step, :2]))
+                    box = shapely.Polygon(middle + half)
+                    corners = shapely.get_coordinates(box)[:4]
+                    gap_m = max(way.project(shapely.Point(corner)) for corner in corners) - place
+                    beside = box.distance(way) <= log.ego_box.width_m / 2 + 1.0
+                    is_near = away_m < reach + np.hypot(4.5, 1.8) / 2
+                    seen |= bool(is_near and beside and 0.0 < gap_m < reach + 4.5)
+        out.append(seen)
+    return np.array(out)
+
+
+def test_road_users_ahead_are_those_that_are_found_one_by_one():
+    rng = np.random.default_rng(5)
+    actors = {
+        f"car-{n}": track(
+            rng.uniform(0, 80) + rng.uniform(-9, 9) * T, rng.uniform(-6, 6) + rng.uniform(-1, 1) * T
+        )
+        for n in range(6)
+    }
+    log, _ = drive(track(V * T), actors=actors)
+    line = np.column_stack([np.arange(0.0, 97.0), 0.5 * np.sin(np.arange(0.0, 97.0) / 15.0)])
+    s = V * T
+    reach_m = np.linspace(15.0, 5.0, len(T))
+    expected = seen_ahead(log, line, s, reach_m)
+    assert 10 < expected.sum() < len(T) - 10
+    preset = PRESETS["strict"]
+    from_origin = line - origin_of(log.ego_log, preset)[:2]
+    found = actor_ahead(log, preset, from_origin, s, reach_m, np.arange(len(T)))
+    assert found.tolist() == expected.tolist()
 
 
 def test_a_stop_of_the_recording_excuses_a_stop_there_but_not_a_longer_one():

@@ -13,6 +13,7 @@ import shapely
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.lane_areas import lane_polygon
 from scenarios.lanelet2 import read_street
 from scenarios.load import load_scenario
 from scenarios.recorded import SourceFiles
@@ -114,9 +115,12 @@ def test_a_light_holds_back_its_lanelets_at_its_line_and_the_expert_waits(tmp_pa
     made = load_scenario(file, None, route)
     signal, other = made.lane_map.signals
     assert (signal.name, signal.lanes) == (other.name, other.lanes) == ("7", ("1",))
-    assert signal.head[1:] + made.world_origin[1:] == pytest.approx([5.25, 4.0])
-    assert other.head[1:] + made.world_origin[1:] == pytest.approx([7.0, 3.0])
-    assert len(made.lane_map.poles) == 2
+    assert signal.head[1:] + made.world_origin[1:] == pytest.approx([5.25, 5.5])  # over lanes
+    assert other.head[1:] + made.world_origin[1:] == pytest.approx([7.0, 5.5])
+    feet = [shapely.Point(pole[0, :2]) for pole in made.lane_map.poles]
+    areas = [lane_polygon(lane) for lane in made.lane_map.lanes.values()]
+    assert len(feet) == 2
+    assert min(foot.distance(area) for foot in feet for area in areas) > 0.5
     assert signal.stop[:, 0] + made.world_origin[0] == pytest.approx([1150.0, 1150.0])
     x = made.ego_log.xyz[:, 0] + made.world_origin[0]
     front = x + made.vehicle.rear_axle_to_centre_m + made.vehicle.box.length_m / 2
