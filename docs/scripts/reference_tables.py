@@ -22,6 +22,7 @@ from pydantic_core import PydanticUndefined
 
 from alpasim_plugin.cameras.transforms import RIG
 from alpasim_plugin.cli.main import PANELS, load_verb
+from alpasim_plugin.cli.options import METAVARS
 from alpasim_plugin.control.can_codec import DBC
 from alpasim_plugin.core.metric_types import MetricInfo
 from alpasim_plugin.drives.colmap import COLMAP
@@ -53,8 +54,10 @@ FORMATS = (
     *(PLY, COMPRESSED, SPZ, SOG, TRANSFORMS, RIG, TRAINED_FRAME, COLMAP, KITTI, PY123D),
     *(ARGOVERSE, CALIBRATION, USDZ, LENS, OPENDRIVE, LANELET2, COMMONROAD, OSI, DBC, ASL),
 )
+MAIN_VERB = "run"
+KIND = " kind: "  # in the name of a section: of which kind of a list it is
 EVERY_VERB = ("--json", "--debug", "--help")
-TYPES = {float: "number", int: "integer", str: "text", bool: "boolean"}
+TYPES = {float: "number", int: "integer", str: "text", bool: "boolean", Path: "path"}
 SIGNS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
@@ -80,16 +83,48 @@ def verb_section(name: str, command: Any) -> str:
             continue
         written_names = ", ".join(f"`{name}`" for name in names)
         again = "..." if meaning.endswith(" Repeatable.") else ""
-        rows.append((written_names + again, meaning.removesuffix(" Repeatable.")))
+        row = (written_names + again, option_value(option), option_default(option))
+        rows.append((*row, meaning.removesuffix(" Repeatable.")))
     text = " ".join((command.help or "").partition("\n\n")[0].split())
-    options = "\n" + table(("option", "meaning"), rows) if rows else ""
+    head = ("option", "value", "default", "meaning")
+    options = "\n" + table(head, rows) if rows else ""
     return f"## {name}\n{text}\n{options}"
 
 
+def option_value(option: Any) -> str:
+    """Return what an option takes, with its bounds; empty for a switch and for an argument, whose
+    name says it.
+    """
+    if option.param_type_name == "argument" or option.is_flag:
+        return ""
+    if option.metavar and option.metavar not in METAVARS.values():
+        return f"`{option.metavar}`"
+    kind = type_name(option.type_descriptor.annotation)
+    if option.min is not None and option.max is not None:
+        return f"{kind}, {option.min}..{option.max}"
+    return kind if option.min is None else f"{kind}, >= {option.min}"
+
+
+def option_default(option: Any) -> str:
+    """Return what holds where an option is left out; empty where that is nothing, or where the
+    meaning says it.
+    """
+    if option.required:
+        return "required"
+    if option.secondary_opts:  # a switch with a name for each side
+        (name,) = option.opts if option.default else option.secondary_opts
+        return f"`{name}`"
+    is_nothing = option.default is None or option.default is False or option.default in ([], "")
+    return "" if is_nothing else f"`{option.default}`"
+
+
 def cli_tables() -> str:
-    """Return a section for each verb of this package, in the order of the help page."""
+    """Return a section for each verb of this package: the main job, then the others in the order of
+    the help page.
+    """
     sections = []
-    for verb in (verb for panel in PANELS.values() for verb in panel):
+    in_order = [verb for panel in PANELS.values() for verb in panel]
+    for verb in sorted(in_order, key=lambda verb: verb != MAIN_VERB):
         sections += [verb_section(*one) for one in commands(load_verb(verb), f"simrun {verb}")]
     return "\n".join(sections)
 
@@ -156,21 +191,40 @@ def key_row(name: str, field: FieldInfo) -> tuple[str, str, str, str]:
 
 
 def key_tables() -> str:
-    """Return one table for each section of the schema; keys that several kinds of a list have alike
-    stand in the table of the first one.
+    """Return one table for each section of the schema. Keys that all kinds of a list have alike stand
+    in a table of their own, before those of the kinds.
     """
+    rows_of = {
+        section: [
+            key_row(name, field)
+            for name, field in model.model_fields.items()
+            if not (KIND in section and name == "kind")
+        ]
+        for section, model in models().items()
+    }
+    shared: dict[str, list[tuple[str, str, str, str]]] = {}
+    for section, rows in rows_of.items():
+        owner, is_kind, _ = section.partition(KIND)
+        if is_kind:
+            shared[owner] = [row for row in shared.get(owner, rows) if row in rows]
     sections = []
-    printed_rows: dict[str, set[tuple[str, ...]]] = {}
+    begun = set()
     for section, model in models().items():
-        owner, _, kind = section.partition(" kind: ")
-        rows = [key_row(name, field) for name, field in model.model_fields.items()
-                if not (kind and name == "kind")]  # fmt: skip
-        new = [row for row in rows if row not in printed_rows.setdefault(owner, set())]
-        printed_rows[owner] |= set(rows)
+        owner, is_kind, _ = section.partition(KIND)
+        if is_kind and owner not in begun and shared[owner]:
+            text = f"Each has `kind`, and beside the keys of its kind these.\n\n{key_table(shared[owner])}"
+            sections.append(f"## `{owner}` of every kind\n{text}")
+        begun.add(owner)
+        own = [row for row in rows_of[section] if row not in shared.get(owner, [])]
         summary = " ".join((model.__doc__ or "").partition("\n\n")[0].split())
-        keys = "\n" + table(("key", "type", "default", "meaning"), new) if new else ""
+        keys = f"\n{key_table(own)}" if own else ""
         sections.append(f"## {f'`{section}`' if section else 'Top level'}\n{summary}\n{keys}")
     return "\n".join(sections)
+
+
+def key_table(rows: Collection[tuple[str, str, str, str]]) -> str:
+    """Return the table of a section's keys."""
+    return table(("key", "type", "default", "meaning"), rows)
 
 
 def fault_table() -> str:

@@ -138,11 +138,13 @@ class Wanted:
     smoke/curve is smoke-curve.
     """
 
-    scenes: Annotated[tuple[str, ...], Flag("Scene to show. Repeatable.", "--scene")] = ()
-    policies: Annotated[tuple[str, ...], Flag("Policy to show. Repeatable.", "--policy")] = ()
-    seeds: Annotated[tuple[int, ...], Flag("Seed to show. Repeatable.", "--seed")] = ()
+    scenes: Annotated[tuple[str, ...], Flag("Take this scene alone. Repeatable.", "--scene")] = ()
+    policies: Annotated[
+        tuple[str, ...], Flag("Take this policy alone. Repeatable.", "--policy")
+    ] = ()
+    seeds: Annotated[tuple[int, ...], Flag("Take this seed alone. Repeatable.", "--seed")] = ()
     renderers: Annotated[
-        tuple[str, ...], Flag("Renderer to show; all by default. Repeatable.", "--renderer")
+        tuple[str, ...], Flag("Take this renderer alone. Repeatable.", "--renderer")
     ] = ()
 
     @property
