@@ -70,6 +70,9 @@ RGB = tuple[float, float, float]
 HEAD_RGB = (0.96, 0.96, 0.88)
 TAIL_RGB = (0.80, 0.06, 0.05)
 PLATE_RGB = (0.88, 0.88, 0.86)
+STEP = 1.9  # how far a foot is ahead of the body, in strides
+TOE = 0.08  # how far a foot reaches beyond that, as a share of the height
+SEEN_SIGMA = 1.2  # deviations at which the edge of a dense Gaussian is seen
 
 
 def build_actors(scenario: Scenario) -> list[SceneNode]:
@@ -252,8 +255,8 @@ def _person(
         (-stride, -0.04, 0.36, 0.036, 0.034, 0.085, legs * 0.92),
         (1.7 * stride, 0.04, 0.15, 0.030, 0.028, 0.085, legs * 0.9),
         (-1.7 * stride, -0.04, 0.15, 0.030, 0.028, 0.085, legs * 0.85),
-        (1.9 * stride + 0.03, 0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
-        (-1.9 * stride + 0.03, -0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
+        (STEP * stride + 0.03, 0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
+        (-STEP * stride + 0.03, -0.04, 0.02, 0.050, 0.025, 0.015, np.array([0.12, 0.11, 0.10])),
         (0.3 * lean - stride, 0.115, 0.66, 0.026, 0.024, 0.085, coat * 0.88),
         (0.3 * lean + stride, -0.115, 0.66, 0.026, 0.024, 0.085, coat * 0.88),
         (0.6 * lean - 1.5 * stride, 0.12, 0.50, 0.022, 0.020, 0.040, skin),
@@ -266,7 +269,10 @@ def _person(
 
 
 def _pedestrian(box: Box, draw: F64, noise: F64, cell_m: float) -> GaussianCloud:
-    return _person(box.height_m, box.width_m, draw, 0.05 + 0.06 * draw[5], -box.height_m / 2)
+    """Draw somebody who walks with strides as long as the box."""
+    longest = (box.length_m / box.height_m / 2 - TOE) / STEP
+    stride = min(0.05 + 0.06 * draw[5], max(longest, 0.0))
+    return _person(box.height_m, box.width_m, draw, stride, -box.height_m / 2)
 
 
 def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) -> GaussianCloud:
@@ -277,11 +283,13 @@ def _two_wheeler(box: Box, draw: F64, noise: F64, cell_m: float, heavy: bool) ->
     bottom = -height / 2
     wheel_x = np.array([1.0, -1.0]) * (length / 2 - radius)
     angle = np.linspace(0, 2 * np.pi, 20 if cell_m < 0.3 else 8, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)]) * radius
+    thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
+    tyre_m = 2.2 * thick
+    ring = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)])
+    ring *= radius - SEEN_SIGMA * tyre_m
     centres = np.array([[x, 0.0, bottom + radius] for x in wheel_x])
     rim = (centres[:, None] + ring[None]).reshape(-1, 3)
-    thick = (0.05 if heavy else 0.022) * (20 / len(angle)) ** 0.5
-    tyres = _blobs(rim, (2.2 * thick, 1.2 * thick, 2.2 * thick), TYRE_RGB)
+    tyres = _blobs(rim, (tyre_m, 1.2 * thick, tyre_m), TYRE_RGB)
     body = _drawn(BODY_RGB, draw[0])
     seat = np.array([-0.12 * length, 0, bottom + 0.52 * height])
     bar = np.array([0.26 * length, 0, bottom + 0.60 * height])

@@ -12,6 +12,7 @@ import argparse
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -176,11 +177,17 @@ def scenes_of(folder: Path, path: Path, options: argparse.Namespace) -> Iterator
         seed += 1
 
 
+@lru_cache(maxsize=1)
+def loaded(scene: Path) -> Scenario:
+    """Return a scene, which the expert drives once for all policies."""
+    return load_scenario(scene)
+
+
 def passes_light(scene: Path) -> bool:
     """Return whether the route of a scene passes a traffic light before its goal."""
     answer = scene.with_suffix(".light.json")
     if not answer.exists():
-        scenario = load_scenario(scene)
+        scenario = loaded(scene)
         lane_map = scenario.lane_map
         line = scenario.ego_log.xyz
         path = smooth_path(line[thinned(line, 1.0)])
@@ -193,13 +200,13 @@ def drives_of(folder: Path, path: Path, options: argparse.Namespace) -> dict[str
     """Drive the routes of one map with every policy; drives of before are read back."""
     drives: dict[str, list[Drive]] = {policy: [] for policy in options.policies.split(",")}
     for scene in scenes_of(folder, path, options):
-        scenario = None
         for policy, done in drives.items():
             record = folder / "drives" / f"{scene.stem}-{policy}.json"
             if not record.exists():
-                scenario = scenario or load_scenario(scene)
                 record.parent.mkdir(exist_ok=True)
-                record.write_text(json.dumps(asdict(drive(scenario, policy))), encoding="utf-8")
+                record.write_text(
+                    json.dumps(asdict(drive(loaded(scene), policy))), encoding="utf-8"
+                )
             done.append(Drive(**json.loads(record.read_text(encoding="utf-8"))))
             print(record.stem, done[-1], flush=True)
     return drives
