@@ -11,6 +11,7 @@ format's public description (LaneletPrimitives, RegulatoryElementTagging).
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from alpasim_plugin.core.files.fields import Fields, field_name
 from alpasim_plugin.core.geometry import arc_lengths, centre_line, heading_of, se2, transform_points
 from alpasim_plugin.core.types import F64, Box, Lane, LaneMap, LaneMarkType, Signal
 from scenarios.commonroad_map import mark_intersections
+from scenarios.countries import country_at
 from scenarios.light_posts import Carriageway
 from scenarios.map_lines import is_left_of, rails
 from scenarios.map_route import Spot
@@ -131,6 +133,7 @@ class Osm:
         self.rules = self.relations("regulatory_element")
         used = {ref for way in self._used_ways() for ref in self.nodes(way)}
         self.xyz, self.origin, self.notes = self._placed({key: places[key] for key in sorted(used)})
+        self.country = _country(places[key] for key in sorted(used))
 
     def relations(self, kind: str) -> dict[str, Item]:
         """Return the relations of one type."""
@@ -240,6 +243,14 @@ class Osm:
         return bool(local)
 
 
+def _country(places: Iterable[Mapping[str, str]]) -> str | None:
+    """Return the country of the first node with latitude and longitude; None where it is not known."""
+    for place in places:
+        with contextlib.suppress(ValueError):
+            return country_at(float(place.get("lat", "")), float(place.get("lon", "")))
+    return None
+
+
 def _in_tangent_plane(table: F64) -> tuple[F64, float, float]:
     """Project longitude and latitude ``(N, 3)`` (degrees; heights, metres, stay) onto the plane that
     touches the earth in their middle: east, north, and latitude and longitude of that middle. A map
@@ -326,6 +337,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         spots,
         osm.origin,
         (*osm.notes, *notes, *LANELET2.notes(_met(osm))),
+        osm.country,
     )
 
 
@@ -474,6 +486,7 @@ def _lane(
         left_mark_type=_mark_type(osm.items["way"][left.way]),
         right_mark_type=_mark_type(osm.items["way"][right.way]),
         speed_limit_mps=limit_mps,
+        is_motorway=osm.lanelets[key.removeprefix("-")].tags.get("subtype") == "highway",
     )
     even_left, even_right = rails(lane)
     return replace(lane, left=even_left, right=even_right)

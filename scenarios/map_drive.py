@@ -17,10 +17,12 @@ from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.path_end import remaining
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import F64, Actor, Bool, LaneMap, Route, Signal, Vehicle
+from alpasim_plugin.world.markings import with_default_markings
 from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.build import TRACKED_EVERY, with_last
+from scenarios.countries import centre_line
 from scenarios.ego_path import grid
 from scenarios.expert import Follower, drive
 from scenarios.junction_rules import turning_lines
@@ -73,9 +75,8 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     way = graph.carried_on(way, AHEAD_M)
     line = graph.line(way)
     front_m = vehicle.rear_axle_to_centre_m + vehicle.box.length_m / 2
-    lane_map, heads = _with_signals(
-        street, _around(street, line), line, front_m, spec.ego.cruise_mps
-    )
+    around = with_default_markings(_around(street, line), centre_line(street.country))
+    lane_map, heads = _with_signals(street, around, line, front_m, spec.ego.cruise_mps)
     keep = line.s <= goal_m + front_m + 1.0
     driven = _inside_bends(
         Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep]), front_m

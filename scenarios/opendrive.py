@@ -405,6 +405,7 @@ def read_street(files: SourceFiles, path: Path) -> StreetMap:
         spots,
         origin,
         (*_signs_by_type(odr), *notes, *light_notes),
+        odr.country,
     )
 
 
@@ -501,7 +502,14 @@ def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequ
         right_mark_type=_mark_type(right_mark),
         is_intersection=road.junction != "-1",
         speed_limit_mps=min(limits, default=None),
+        is_motorway=_is_motorway(road, section),
     )
+
+
+def _is_motorway(road: Road, section: Section) -> bool:
+    """Return whether a road is a motorway where a section begins."""
+    begun = [kind for start_m, kind in road.kinds if start_m <= section.s_m]
+    return bool(begun) and begun[-1] == "motorway"
 
 
 def _marks(road: Road, section: Section, lane: OdrLane) -> tuple[RoadMark | None, RoadMark | None]:

@@ -246,6 +246,7 @@ class Road:
     signals: tuple[RoadSignal, ...] = ()
     crosswalks: tuple[F64, ...] = ()  # rings (N, 2) of s and t
     limits: tuple[Limit, ...] = ()
+    kinds: tuple[tuple[float, str], ...] = ()  # from a place on, metres: motorway, town ...
 
     @property
     def has_level_lanes(self) -> bool:
@@ -277,6 +278,7 @@ class OdrMap:
     geo_reference: str
     controllers: Mapping[str, str]  # signal to the controller that switches it
     notes: tuple[str, ...] = ()
+    country: str | None = None  # a code of ISO 3166, where all roads that name one agree
 
 
 def parse_map(location: Path | str, root: Element) -> OdrMap:
@@ -314,7 +316,9 @@ def parse_map(location: Path | str, root: Element) -> OdrMap:
     }
     geo_reference = (root.findtext(".//geoReference") or "").strip()
     notes = (*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root), *_notes(root, unused))
-    return OdrMap(tuple(roads), connections, geo_reference, controllers, notes)
+    countries = {kind.get("country", "").upper() for kind in root.iterfind("road/type")} - {""}
+    country = countries.pop() if len(countries) == 1 else None
+    return OdrMap(tuple(roads), connections, geo_reference, controllers, notes, country)
 
 
 def _connection(junction: Element, connection: Element) -> Connection:
@@ -427,6 +431,7 @@ def _road(
         signals,
         crosswalks,
         tuple((_start_m(kind), _limit_mps(kind.find("speed"))) for kind in types),
+        tuple((_start_m(kind), kind.get("type", "unknown")) for kind in types),
     )
 
 

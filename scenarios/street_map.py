@@ -50,6 +50,7 @@ class StreetMap:
         spots: Places on lanes at a number of metres along a road.
         origin: What was subtracted from the file's coordinates.
         notes: What was assumed or left out.
+        country: Where it lies, a code of ISO 3166; None: not known.
     """
 
     lanes: Mapping[str, Lane]
@@ -60,6 +61,7 @@ class StreetMap:
     spots: Callable[[str, float], list[Spot]]
     origin: tuple[float, float, float]
     notes: tuple[str, ...]
+    country: str | None = None
 
 
 def with_cycles(heads: Sequence[Head], begins_us: Mapping[str, int]) -> tuple[Signal, ...]:

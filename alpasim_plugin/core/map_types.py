@@ -54,6 +54,7 @@ class Lane:
     right_mark_type: LaneMarkType = "unknown"
     is_intersection: bool = False
     speed_limit_mps: float | None = None
+    is_motorway: bool = False  # the map says that its road is one
 
 
 @dataclass(frozen=True)

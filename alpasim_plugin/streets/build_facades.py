@@ -117,11 +117,12 @@ def build_facades(site: Site) -> tuple[list[SceneNode], Houses]:
 
 def place_houses(site: Site) -> Houses:
     """Choose where houses stand: along the line at the setback, clear of the road, of actors and of
-    each other.
+    each other, and not on the islands of roundabouts.
     """
     environment = site.scenario.environment
     rng = site.rng("houses")
-    free = ((site.off_road_m > CLEAR_M) & ~site.taken & site.owned_cells).astype(np.uint8)
+    is_free = (site.off_road_m > CLEAR_M) & ~site.taken & ~site.islands & site.owned_cells
+    free = is_free.astype(np.uint8)
     fronts, aways, heights = [], [], []
     low_m, high_m = environment.building_height_m
     for line in contours(site, SETBACK_M[site.highway], WITHIN_M):

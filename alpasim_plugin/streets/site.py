@@ -39,6 +39,8 @@ CLOSE_GAP_M = 1.5  # gaps between lanes narrower than twice this are road too
 SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
 HIGHWAY_MPS = 22.0
 TILE_M = 32.0  # a section owns whole tiles; all grids of the ground are cut along them
+WIDEST_ISLAND_M = 100.0  # of the middle of a roundabout
+ROUND = 0.88  # share of a round island that its inscribed circle covers; of a square it is 0.79
 HORIZON_M = 160.0  # large Gaussians lie so far around the rasters
 SECTION_M = 250  # of the path
 OVERLAP_M = 40  # a section's path goes on into its neighbours
@@ -137,6 +139,24 @@ class Site:
         mask = np.zeros(self.road.shape, dtype=np.uint8)
         cv2.polylines(mask, [self.pixels(self.path)], False, 1, 1, cv2.LINE_8, SHIFT_BITS)
         return distance_m(mask.astype(bool))
+
+    @cached_property
+    def islands(self) -> Bool:
+        """Return ``(H, W)`` which cells lie on islands: round land with road all around, as in the
+        middle of a roundabout. Blocks of houses have corners.
+        """
+        count, number, stats, _ = cv2.connectedComponentsWithStats((~self.road).astype(np.uint8))
+        h, w = self.road.shape
+        island = np.zeros(count, dtype=bool)
+        for k in range(1, count):
+            left, top, width, height, cells = stats[k].tolist()
+            is_enclosed = left > 0 and top > 0 and left + width < w and top + height < h
+            if is_enclosed and max(width, height) * CELL_M < WIDEST_ISLAND_M:
+                window = slice(top, top + height), slice(left, left + width)
+                inside = number[window] == k
+                radius_m = float(self.off_road_m[window][inside].max())
+                island[k] = np.pi * radius_m**2 > ROUND * cells * CELL_M**2
+        return island[number]
 
     def pixels(self, plan: F64) -> npt.NDArray[np.int32]:
         """Return ground points ``(N, 2)`` as fixed-point pixels for OpenCV's drawing functions."""
@@ -290,9 +310,12 @@ def _lane_rings(lanes: Iterable[Lane]) -> list[F64]:
 
 
 def _is_highway(scenario: Scenario, near: list[Lane]) -> bool:
-    """Return whether the road is a highway: by speed limits, or without them by four parallel lanes
-    and no crossing.
+    """Return whether the road is a highway: by what the map calls its roads, else by speed limits, or
+    without them by four parallel lanes and no crossing.
     """
+    driven = [lane.is_motorway for lane in near if lane.kind == "vehicle"]
+    if 2 * sum(driven) > len(driven):
+        return True
     if (
         scenario.lane_map.crosswalks
         or any(lane.is_intersection for lane in near)

@@ -103,11 +103,13 @@ def marking_lines(lane_map: LaneMap) -> list[tuple[F64, LaneMarkType]]:
     return [(edges.all[i].line, edges.all[i].mark_type) for i in sorted(taken)]
 
 
-def with_default_markings(lane_map: LaneMap) -> LaneMap:
+def with_default_markings(
+    lane_map: LaneMap, centre_line: LaneMarkType = "double_yellow"
+) -> LaneMap:
     """Return a map whose unknown lane markings are chosen, for a road that is built from it.
 
     An edge shared by two lanes of one direction is a dashed white line, one between opposing lanes
-    a double yellow one, an outer edge a solid white line; inside intersections there is none.
+    a ``centre_line``, an outer edge a solid white line; inside intersections there is none.
     In maps with marking lines of their own, lane edges of unknown markings stay as they are, and
     unknown marking lines are solid white.
     """
@@ -121,15 +123,17 @@ def with_default_markings(lane_map: LaneMap) -> LaneMap:
     chosen: dict[tuple[str, int], LaneMarkType] = {}
     for i, edge in enumerate(edges.all):
         if edge.mark_type == "unknown":
-            chosen[edge.lane_id, edge.side] = "none" if edge.in_junction else _default(edges, i)
+            chosen[edge.lane_id, edge.side] = _default(edges, i, centre_line)
     lanes = {name: _marked(lane, chosen) for name, lane in lane_map.lanes.items()}
     return replace(lane_map, lanes=lanes)
 
 
-def _default(edges: _Edges, i: int) -> LaneMarkType:
-    """Return the marking of an unknown edge: that of a known one along it, else what its neighbours
-    suggest.
+def _default(edges: _Edges, i: int, centre_line: LaneMarkType) -> LaneMarkType:
+    """Return the marking of an unknown edge: none inside intersections, that of a known one along it,
+    else what its neighbours suggest.
     """
+    if edges.all[i].in_junction:
+        return "none"
     samples = edges.beside(i)
     marked = [edge.mark_type for edge in edges.all if edge.mark_type not in ("none", "unknown")]
     for mark_type in ("none", *dict.fromkeys(marked)):
@@ -140,7 +144,7 @@ def _default(edges: _Edges, i: int) -> LaneMarkType:
     opposing = sum(other.side == edges.all[i].side and cosine < -ALONG for other, cosine in beside)
     if max(shared, opposing) < 0.4 * len(samples):
         return "solid_white"
-    return "dashed_white" if shared >= opposing else "double_yellow"
+    return "dashed_white" if shared >= opposing else centre_line
 
 
 def _share_along(
