@@ -127,6 +127,10 @@ BESIDE_M = 2.0  # a body whose rear is so far behind the own front bumper is bes
 MERGE_S = 2.0  # who comes into the corridor from beside within this time is let in
 MERGE_MPS = 0.3  # sideways, at least
 SAME_WAY = 0.5  # cosine between a body and the line that it drives along
+ON_FOOT_M = 0.6  # half the length of a body below which it is somebody on foot
+WALK_S = 3.0  # somebody who steps into the corridor within this time is waited for ...
+CLEAR_S = 1.0  # ... unless the driver has passed so long before
+STANDS_MPS = 0.1
 BEHIND_M = 15.0  # a body is looked for so far behind the own front bumper
 _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -207,6 +211,7 @@ def find_leaders(
     rear end is not more than `BESIDE_M` behind the own front bumper, so that touching bodies still count.
     With ``lets_merge`` a longer body beside counts too that drives the same way, has its nose ahead, and
     reaches into the corridor or will within `MERGE_S`; until it does, the gap is that to its nose.
+    So does somebody on foot ahead who will step into the corridor; see `_steps_in`.
 
     Args:
         lines: All lines.
@@ -217,7 +222,7 @@ def find_leaders(
         horizon_m: ``(N,)`` how far each driver looks.
         own_row: ``(N,)`` rows of the drivers in ``bodies``, -1 where they are not among them.
         margin_m: Added to the half width.
-        lets_merge: Whether drivers let in who merges from beside.
+        lets_merge: Whether drivers let in who merges from beside, and wait for who steps in.
     """
     if len(bodies.xy) == 0:  # an empty road: half of the calls of a built scene
         return [NO_LEADER] * len(line)
@@ -242,11 +247,45 @@ def find_leaders(
         ahead[beside[merges]] = True
         comes_in = merges & ~inside[beside]
         gap_m[beside[comes_in]] = nose_m[beside[comes_in]]
+        on_foot = bodies.half_length_m[body] < ON_FOOT_M
+        walkers = np.flatnonzero(
+            on_foot & span.on_level & ~inside & (gap_m > 0.0) & (gap_m < horizon_m[driver])
+        )
+        if len(walkers):
+            own_mps = np.where(own_row < 0, 0.0, np.hypot(*bodies.velocity[own_row].T))
+            arrives_s = gap_m[walkers] / np.maximum(own_mps[driver[walkers]], STANDS_MPS)
+            steps_s = _steps_in(
+                lines, line[driver], span, walkers, reach[driver], bodies.velocity[body[walkers]]
+            )
+            ahead[walkers] = (steps_s < WALK_S) & (steps_s < arrives_s + CLEAR_S)
     out = [NO_LEADER] * len(line)
     for k in np.lexsort((body, gap_m))[::-1]:  # the nearest last
         if ahead[k]:
             out[driver[k]] = Leader(float(gap_m[k]), float(span.speed[k]), int(body[k]))
     return out
+
+
+def _steps_in(
+    lines: Lines, line: I64, span: Spans, walkers: I64, reach_m: F64, velocity: F64
+) -> F64:
+    """Return in how many seconds ``(W,)`` people beside the corridors of lines step into them;
+    infinite for those who do not.
+
+    Args:
+        lines: All lines.
+        line: ``(P,)`` the one of each row of ``span``.
+        span: Where bodies are on lines.
+        walkers: ``(W,)`` rows of the people in ``span``.
+        reach_m: ``(P,)`` half widths of the corridors.
+        velocity: ``(W, 2)`` of the people.
+    """
+    _, line_yaw = lines.at(line[walkers], span.rear[walkers])
+    left_mps = velocity[:, 1] * np.cos(line_yaw) - velocity[:, 0] * np.sin(line_yaw)
+    is_left = span.low[walkers] > 0.0
+    away_m = np.where(is_left, span.low[walkers], -span.high[walkers]) - reach_m[walkers]
+    nearer_mps = np.where(is_left, -left_mps, left_mps)
+    steps_in = nearer_mps > MERGE_MPS
+    return np.where(steps_in, away_m / np.where(steps_in, nearer_mps, 1.0), np.inf)
 
 
 def _least_offsets(

@@ -120,3 +120,38 @@ def test_who_comes_into_the_scene_is_where_its_track_is(first_us):
     t_us = np.arange(2_000_000, 2_400_001, STEP_US)
     expected_m = 20.0 * (t_us - first_us)[-len(poses) :] * 1e-6
     np.testing.assert_allclose(poses[:, 0, 3], expected_m, atol=0.02)
+
+
+def walker(begin_m, speed_mps, x_m):
+    """Somebody who walks across the road to the left at a place."""
+    t_us = STEP_US * np.arange(201, dtype=np.int64)
+    y = begin_m + speed_mps * t_us * 1e-6
+    track = Trajectory(
+        t_us,
+        np.column_stack([np.full(len(t_us), x_m), y, np.full(len(t_us), 0.9)]),
+        quat_from_yaw(np.full(len(t_us), np.pi / 2)),
+    )
+    return Actor("walker", "pedestrian", Box(0.6, 0.6, 1.75), track)
+
+
+@pytest.mark.parametrize("begin_m", [-4.0, -4.5, -5.5])
+def test_a_driver_waits_for_somebody_who_steps_into_its_way(begin_m):
+    """It begins to brake before the step, and drives on behind."""
+    car = driver("car", np.arange(0.0, 150.0))
+    poses = driven([car, walker(begin_m, 1.3, 30.0)], 15_000_000)
+    x = poses["car"][:, 0, 3]
+    y = poses["walker"][:, 1, 3]
+    in_the_way = np.abs(y) < 1.3
+    assert (x[in_the_way] + CAR.length_m / 2 < 29.4).all()
+    speed_mps = np.diff(x) / 0.1
+    assert np.diff(speed_mps).min() / 0.1 > -8.0
+    assert x[-1] > 60.0  # it goes on
+
+
+@pytest.mark.parametrize(("begin_m", "speed_mps"), [(-5.0, 0.0), (-9.5, 1.3), (2.0, 1.3)])
+def test_a_driver_does_not_wait_for_people_beside_the_road(begin_m, speed_mps):
+    """They stand, come when it has passed, or walk away."""
+    alone = driven([driver("car", np.arange(0.0, 150.0))], 8_000_000)["car"][:, 0, 3]
+    car = driver("car", np.arange(0.0, 150.0))
+    x = driven([car, walker(begin_m, speed_mps, 30.0)], 8_000_000)["car"][:, 0, 3]
+    assert x == pytest.approx(alone, abs=0.2)
