@@ -2,6 +2,7 @@
 all of them.
 """
 
+import importlib
 import re
 
 import pytest
@@ -66,3 +67,10 @@ def test_every_verb_of_the_laboratory_is_there_and_on_a_page(repo):
     text = "\n".join(page.read_text(encoding="utf-8") for page in lab_pages(repo))
     assert {verb for verb, where in verbs().items() if ".lab." in where} == set(LAB_VERBS)
     assert [verb for verb in LAB_VERBS if not re.search(rf"simrun {verb}\b", text)] == []
+
+
+def test_the_stages_on_the_page_of_the_systems_are_those_of_the_recipes(repo, monkeypatch):
+    monkeypatch.syspath_prepend(str(repo / "docs" / "scripts"))
+    for path, text in importlib.import_module("recipe_table").written().items():
+        stale = f"{path.name} is stale: run python docs/scripts/recipe_table.py"
+        assert path.read_text(encoding="utf-8") == text, stale
