@@ -1,1 +1,1 @@
-"""Published numbers that ours are printed beside."""
+"""Budgets at which the comparison of the paper is made again (`simrun bench paper`)."""

@@ -41,8 +41,9 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         scenes; None of one), ``n``, ``unit``, ``direction``; ``paired``: VARIANT -> METRIC ->
         ``diff`` (the mean), ``spread``, ``median``, ``median_ci95`` ([low, high], or None with
         ``reason``), ``n_better``, ``n_worse``, ``n``; ``sets``: VARIANT -> METRIC -> a distance of
-        all its clips from the true ones (`sets.set_distances`); ``identical``, ``events``,
-        ``frames``, ``clips``, ``scenes`` by variant.
+        all its clips from the true ones (`sets.set_distances`); ``by_scene``: VARIANT -> METRIC ->
+        SCENE -> the scene's value, from which any two variants can be compared; ``identical``,
+        ``events``, ``frames``, ``clips``, ``scenes`` by variant.
 
     Raises:
         EvaluatorError: No row of the baseline.
@@ -58,13 +59,17 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
     arms: dict[str, Any] = {}
     paired: dict[str, Any] = {}
     sets: dict[str, Any] = {}
+    by_scene: dict[str, Any] = {}
     names_of_facts = ("clips", "scenes", "frames", "identical", "events")
     facts: dict[str, dict[str, Any]] = {key: {} for key in names_of_facts}
     for name, by_clip in variants.items():
         clip_rows = list(by_clip.values())
+        by_scene[name] = {
+            metric: scene_values(clip_rows, metric) for metric in metrics_of(clip_rows)
+        }
         arms[name] = {
-            metric: _mean(scene_values(clip_rows, metric), metric)
-            for metric in metrics_of(clip_rows)
+            metric: _mean(list(values.values()), metric)
+            for metric, values in by_scene[name].items()
         }
         if name not in (baseline, TRUTH):
             paired[name] = _paired(by_clip, variants[baseline])
@@ -78,7 +83,8 @@ def summarise(rows: Sequence[Row], baseline: str) -> dict[str, Any]:
         facts["frames"][name] = sorted({int(row["frames"]) for row in clip_rows})
         facts["identical"][name] = sum(int(row["identical"]) for row in clip_rows)
         facts["events"][name] = dict(events)
-    return {"baseline": baseline, "arms": arms, "paired": paired, "sets": sets, **facts}
+    tables = {"arms": arms, "paired": paired, "sets": sets, "by_scene": by_scene}
+    return {"baseline": baseline, **tables, **facts}
 
 
 def metrics_of(rows: Sequence[Row]) -> list[str]:
@@ -94,20 +100,20 @@ def value_of(row: Row, metric: str) -> float:
     return float(np.median(row[MS])) if metric == MS else float(row["values"][metric])
 
 
-def scene_values(rows: Sequence[Row], metric: str) -> list[float]:
-    """Return the mean over the clips of every scene that carry a metric, in the order of their
-    first rows.
+def scene_values(rows: Sequence[Row], metric: str) -> dict[str, float]:
+    """Return the mean over the clips of every scene that carry a metric, by scene, in the order of
+    their first rows.
     """
     carried = [row for row in rows if _carries(row, metric)]
     return _scene_means(carried, [value_of(row, metric) for row in carried])
 
 
-def _scene_means(rows: Sequence[Row], values: Sequence[float]) -> list[float]:
+def _scene_means(rows: Sequence[Row], values: Sequence[float]) -> dict[str, float]:
     """Return the mean by scene of one value a row."""
     by_scene: dict[str, list[float]] = {}
     for row, value in zip(rows, values, strict=True):
         by_scene.setdefault(str(row["scene"]), []).append(value)
-    return [float(np.mean(of_clips)) for of_clips in by_scene.values()]
+    return {scene: float(np.mean(of_clips)) for scene, of_clips in by_scene.items()}
 
 
 def _carries(row: Row, metric: str) -> bool:
@@ -132,7 +138,7 @@ def _paired(rows: Mapping[str, Row], baseline: Mapping[str, Row]) -> dict[str, A
         if not carried:
             continue
         by_clip = [value_of(a, metric) - value_of(b, metric) for a, b in carried]
-        differences = np.array(_scene_means([a for a, _ in carried], by_clip))
+        differences = np.array([*_scene_means([a for a, _ in carried], by_clip).values()])
         gains = differences if FACTS[metric].direction == "higher" else -differences
         interval = median_interval(differences, "scenes")
         out[metric] = {

@@ -1,0 +1,1 @@
+"""The paper's comparison as one experiment: its stages, its tables, its claims."""
