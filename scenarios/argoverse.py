@@ -40,7 +40,8 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.world.ground import from_points
-from scenarios.map_lines import border_lines, lane_edges, merge_areas, same_way
+from scenarios.map_borders import lane_edges, surface_borders
+from scenarios.map_lines import same_way
 from scenarios.recorded import RecordedLog, SourceFiles, actors_of_track, checked_trajectory, near
 
 # Argoverse 2 mark types -> the markings a scene can show. Mixed lines take their solid half; double
@@ -164,7 +165,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             _crossing(files, f"{path}, crossing {key}", raw, origin)
             for key, raw in raw_crossings.items()
         )
-        surface = merge_areas([shapely.Polygon(area[:, :2]) for area in areas])
+        edges = surface_borders([shapely.Polygon(area[:, :2]) for area in areas], areas, areas)
     lane_map = LaneMap(
         {
             key: replace(
@@ -174,7 +175,7 @@ def read_map(files: SourceFiles, path: Path, origin: F64) -> tuple[LaneMap, tupl
             )
             for key, lane in lanes.items()
         },
-        road_edges=border_lines(surface, np.concatenate(areas)),
+        road_edges=edges,
         drivable_areas=areas,
         crosswalks=crossings,
     )

@@ -17,7 +17,7 @@ from alpasim_plugin.core.files import limits as b
 from alpasim_plugin.core.geometry import arc_lengths
 from alpasim_plugin.core.types import F64, Scenario
 from alpasim_plugin.world.ground import BUILT_WHOLE_M
-from scenarios.map_lines import lane_edges
+from scenarios.map_borders import lane_edges
 from scenarios.recorded import RecordedLog
 
 REACH_M = 110.0  # the surroundings are built so far from the drive

@@ -16,14 +16,8 @@ from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.geometry import centre_line, heading_of
 from alpasim_plugin.core.lane_areas import lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType, Signal
-from scenarios.map_lines import (
-    MEET_M,
-    border_lines,
-    is_left_of,
-    lane_edges,
-    merge_areas,
-    predecessors,
-)
+from scenarios.map_borders import lane_borders
+from scenarios.map_lines import MEET_M, is_left_of, predecessors
 from scenarios.recorded import near
 
 # Line markings of version 2020a; the format has no colour, so lines are white.
@@ -137,10 +131,9 @@ def read_lanelets(path: Path, root: Element, origin: F64) -> tuple[LaneMap, tupl
             signals += _signals(lanelet, lane.centre, waiting_line, lights)
             if _has_stop_line(lanelet):
                 stop_lines.append(waiting_line)
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
     lane_map = LaneMap(
         lanes=mark_intersections(lanes),
-        road_edges=border_lines(surface, np.concatenate(lane_edges(lanes))),
+        road_edges=lane_borders(lanes),
         crosswalks=tuple(_ring(lanelet) for lanelet in lanelets if "crosswalk" in lanelet.types),
         stop_lines=tuple(stop_lines),
         signals=tuple(signals) or None,

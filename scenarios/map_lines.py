@@ -1,5 +1,4 @@
-"""Lines of lane maps: lanes' edges and order, borders of the drivable surface, and a map as
-AlpaSim's loader reads it.
+"""Lines of lane maps: lanes' edges and order, and a map as AlpaSim's loader reads it.
 
 AlpaSim's rules look for lane centres and road edges by vertex, so the places of vertices matter.
 Its map tables hold two rails a lane with the same number of points, and nothing else of its shape:
@@ -9,40 +8,30 @@ segments, which leaves the lane's area as it is. The view so made is the form in
 exported and in which preset ``alpasim`` scores.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import scipy
-import shapely
 
 from alpasim_plugin.core.files import some_of
-from alpasim_plugin.core.geometry import arc_lengths, densify, left_of, matrix_from_quat, unit
-from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
+from alpasim_plugin.core.geometry import arc_lengths, left_of, matrix_from_quat, unit
+from alpasim_plugin.core.lane_areas import HALF_WIDTH_M
 from alpasim_plugin.core.types import F64, HeightField, Lane, LaneMap, Trajectory
 from alpasim_plugin.world.ground import flat, from_points, height_at
 from alpasim_plugin.world.path import polyline_path, thinned
+from scenarios.map_borders import lane_borders, lane_edges
 
 MAX_STEP_M = 2.0
 
 # Every other kind counts: without shoulders the distance to the lane boundary is half a metre off.
 NO_LANES_OF_CARS = ("sidewalk",)
-SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
 MEET_M = 0.1  # linked lanes whose ends lie farther apart do not meet
-MIN_HOLE_M2 = 0.5  # smaller holes are seams too
-STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
 
 # Of the corridor.
 LANE_M = 3.5  # width
 BEFORE_M = 8.0  # how far it goes on before the path
 BEYOND_M = 15.0  # how far it goes on beyond the path
 VERTEX_M = 1.0  # between vertices
-
-
-def lane_edges(lanes: Mapping[str, Lane]) -> list[F64]:
-    """Return the edges ``(N, 3)`` that lanes have, left before right, lane by lane."""
-    return [edge for lane in lanes.values() for edge in (lane.left, lane.right) if edge is not None]
 
 
 def ground_of(lane_map: LaneMap, drive: F64) -> HeightField:
@@ -57,9 +46,7 @@ def ground_of(lane_map: LaneMap, drive: F64) -> HeightField:
 
 def bordered(lanes: Mapping[str, Lane], beside: LaneMap) -> LaneMap:
     """Return a map with lanes and the border of their surface added."""
-    surface = merge_areas([lane_polygon(lane) for lane in lanes.values()])
-    edges = border_lines(surface, np.concatenate(lane_edges(lanes)))
-    return replace(beside, lanes=lanes, road_edges=edges)
+    return replace(beside, lanes=lanes, road_edges=lane_borders(lanes))
 
 
 def corridor(ego: Trajectory, field: HeightField) -> LaneMap:
@@ -237,42 +224,3 @@ def _beside(centre: F64, left_m: float) -> F64:
     out = centre.copy()
     out[:, :2] += left_m * left_of(along)
     return out
-
-
-def merge_areas(areas: Sequence[Any]) -> Any:
-    """Return the union of shapely areas with seams up to `SEAM_M` closed and tiny holes filled.
-
-    Closing is a mitred offset outwards and back, which moves no straight border.
-    """
-    half = SEAM_M / 2
-    merged = shapely.union_all([shapely.make_valid(area) for area in areas])
-    closed = shapely.buffer(merged, half, join_style="mitre", mitre_limit=2.0)
-    closed = shapely.union_all(
-        [merged, shapely.buffer(closed, -half, join_style="mitre", mitre_limit=2.0)]
-    )
-    parts = [part for part in shapely.get_parts(closed) if shapely.get_type_id(part) == 3]
-    filled = [
-        shapely.Polygon(
-            p.exterior, [h for h in p.interiors if shapely.Polygon(h).area >= MIN_HOLE_M2]
-        )
-        for p in parts
-    ]
-    return shapely.union_all(filled)
-
-
-def border_lines(area: Any, heights: F64) -> tuple[F64, ...]:
-    """Return the borders of a shapely area as closed polylines ``(N, 3)``, exterior rings first in
-    each part.
-
-    Args:
-        area: Polygon or MultiPolygon.
-        heights: ``(M, 3)`` points of the source; a border vertex takes the height of the nearest
-            one.
-    """
-    tree = scipy.spatial.KDTree(heights[:, :2])
-    lines = []
-    for part in shapely.get_parts(area):
-        for ring in (part.exterior, *part.interiors):
-            xy = densify(shapely.get_coordinates(ring), STEP_M)
-            lines.append(np.column_stack([xy, heights[tree.query(xy)[1], 2]]))
-    return tuple(lines)

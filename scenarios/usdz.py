@@ -38,7 +38,8 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.types import F64, Actor, Box, Lane, LaneMap, Trajectory, Vehicle
 from alpasim_plugin.world.ground import from_points
 from scenarios.ftheta import FRONT_WIDE, front_wide
-from scenarios.map_lines import lane_edges, with_vertices
+from scenarios.map_borders import lane_edges
+from scenarios.map_lines import with_vertices
 from scenarios.opendrive import T_local_map, lane_map_of
 from scenarios.opendrive_road import MAX_ROAD_M, OdrMap, Road, beside, cubics_at, parse_map
 from scenarios.recorded import RecordedLog, SourceFiles, checked_trajectory

@@ -2,13 +2,14 @@
 policy needs no shapely.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import heading_of
-from alpasim_plugin.core.types import F64, Lane
+from alpasim_plugin.core.types import F64, I64, Lane
 
 HALF_WIDTH_M = 1.85
 WORLD_ORIGIN = np.zeros(3)
@@ -78,3 +79,36 @@ def areal_parts(shape: Any) -> Any:
     if not parts:
         return shapely.Polygon()
     return parts[0] if len(parts) == 1 else shapely.union_all(parts)
+
+
+def touching_pairs(areas: Any, outlines: Sequence[F64], reach_m: float) -> tuple[I64, F64]:
+    """Return the pairs of areas that share a place, or come nearer to each other than twice a
+    distance, and how far they are apart in height there.
+
+    Args:
+        areas: ``(B,)`` plan-view polygons.
+        outlines: B polylines ``(N, 3)`` that give their heights: of a place, that of the nearest
+            point of the line.
+        reach_m: Distance by which areas are widened.
+
+    Returns:
+        Rows ``(P, 2)`` of areas, the lower number first, and differences of height ``(P,)``, metres.
+    """
+    wide = shapely.buffer(areas, reach_m, join_style="mitre")
+    first, second = shapely.STRtree(wide).query(wide, predicate="intersects")
+    pairs = np.stack([first, second], axis=1)[first < second]
+    shared = shapely.intersection(wide[pairs[:, 0]], wide[pairs[:, 1]])
+    has_area = shapely.area(shared) > 0
+    pairs = pairs[has_area]
+    places = shapely.point_on_surface(shared[has_area])
+    lines = np.array([_line_of(outline) for outline in outlines], dtype=object)
+    heights = []
+    for number in pairs.T:
+        along = shapely.line_locate_point(lines[number], places)
+        heights.append(shapely.get_z(shapely.line_interpolate_point(lines[number], along)))
+    return pairs, np.abs(heights[0] - heights[1])
+
+
+def _line_of(outline: F64) -> Any:
+    """Return a polyline ``(N, 3)`` in space; of one point a line without length."""
+    return shapely.linestrings(np.repeat(outline, 2, axis=0) if len(outline) == 1 else outline)

@@ -393,7 +393,7 @@ class _Driver:
         self.path: Path | None = None
         takeover_us = max(closed_us, int(actor.track.t_us[0]))
         if line.is_driven(float(yaw_from_quat(actor.track.quat[0])), takeover_us):
-            self.path = _with_lanes_ahead(line, index)
+            self.path = _with_lanes_ahead(line, index, actor.box.height_m / 2)
             self._vertex_us = line.t_us
         self.lights: tuple[LightAhead, ...] = ()
         self.give_way: tuple[LightAhead, ...] = ()
@@ -519,23 +519,26 @@ class _Driver:
         return T
 
 
-def _with_lanes_ahead(line: _TrackLine, index: LaneIndex | None) -> Path:
-    """Return the path of a track's line, and on along the lanes unless the track folds there."""
+def _with_lanes_ahead(line: _TrackLine, index: LaneIndex | None, half_height_m: float) -> Path:
+    """Return the path of a track's line, and on along the lanes unless the track folds there; the
+    track is that of the middle of a box, half its height above the ground.
+    """
     path = polyline_path(line.xyz)
     if index is None or line.folds:
         return path
     end, heading = path.at(path.length_m)
-    ahead = _lanes_ahead(index, end, float(heading))
+    ahead = _lanes_ahead(index, end, float(heading), half_height_m)
     return path if ahead is None else polyline_path(np.concatenate([line.xyz, ahead]))
 
 
-def _lanes_ahead(index: LaneIndex, end: F64, heading: float) -> F64 | None:
-    """Return the way on from the end of a track: the lane there that runs the same way, and what
+def _lanes_ahead(index: LaneIndex, end: F64, heading: float, half_height_m: float) -> F64 | None:
+    """Return the way on from the end of a track: the lane below it that runs the same way, and what
     follows it.
     """
+    below = end - np.array([0.0, 0.0, half_height_m])
     turns = {
         lane: abs(float(wrap_angle(index.heading_rad(lane, end) - heading)))
-        for lane in index.containing(end[:2])
+        for lane in index.containing(below)
     }
     lane = min(turns, key=lambda lane_id: turns[lane_id], default=None)
     if lane is None or turns[lane] >= MAX_TURN_RAD:

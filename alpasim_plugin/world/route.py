@@ -29,6 +29,11 @@ from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
 from alpasim_plugin.core.types import F64, I64, LaneMap, Route, Trajectory
 
 VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often
+# A lane farther above or below a point than this is another road. A point on a lane's edge may lie
+# so much above or below its middle, or the recording so much above the map; decks of car parks are
+# 2.5 m apart and more.
+LEVEL_M = 2.0
+NEAR_M = 1.0  # places of a lane's middle that are no farther from a point than the nearest and this
 
 
 @dataclass(frozen=True)
@@ -42,8 +47,9 @@ class LanePath:
 class LaneIndex:
     """Index of one `LaneMap`: an STRtree over lane polygons and KD-trees over centre vertices.
 
-    Points are ``(2,)`` or ``(3,)``, metres, world. Distances are taken in 3-D where the point has a
-    height, so that a bridge does not answer for the road below it, and in plan view where it has
+    Points are ``(2,)`` or ``(3,)``, metres, world; one with a height lies on the ground. Distances
+    are taken in 3-D where the point has a height, and lanes farther than `LEVEL_M` above or below it
+    do not count, so that a bridge does not answer for the road below it; in plan view where it has
     none. Answers are in the map's own order of lanes.
 
     Example:
@@ -68,23 +74,47 @@ class LaneIndex:
         )
 
     def containing(self, point: F64) -> tuple[str, ...]:
-        """Return the lanes whose polygon holds the point in plan view, its border included."""
-        return self.containing_many(point[None, :2])[0]
+        """Return the lanes at the point's height whose polygon holds it in plan view, its border
+        included.
+        """
+        return self.containing_many(point[None])[0]
 
-    def containing_many(self, xy: F64) -> list[tuple[str, ...]]:
-        """Return `containing` for each of ``(N, 2+)`` points at once."""
-        points = shapely.points(np.ascontiguousarray(xy[:, :2]))
-        lane_numbers: list[list[int]] = [[] for _ in range(len(xy))]
-        for i, j in self._tree.query(points, predicate="intersects").T.tolist():
+    def containing_many(self, points: F64) -> list[tuple[str, ...]]:
+        """Return `containing` for each of ``(N, 2)`` or ``(N, 3)`` points at once."""
+        places = shapely.points(np.ascontiguousarray(points[:, :2]))
+        point, lane = self._tree.query(places, predicate="intersects")
+        if points.shape[1] > 2:
+            is_level = self._apart_m(point, lane, points) <= LEVEL_M
+            point = point[is_level]
+            lane = lane[is_level]
+        lane_numbers: list[list[int]] = [[] for _ in range(len(points))]
+        for i, j in zip(point.tolist(), lane.tolist(), strict=True):
             lane_numbers[i].append(j)
         return [tuple(self.ids[j] for j in sorted(js)) for js in lane_numbers]
 
+    def _apart_m(self, point: I64, lane: I64, points: F64) -> F64:
+        """Return how far ``(P,)`` lanes are above or below points in pairs ``(P,)`` of both; of a lane
+        that winds above itself the level counts that is nearest.
+        """
+        out = np.zeros(len(point))
+        for number in np.unique(lane).tolist():
+            pairs = np.flatnonzero(lane == number)
+            xyz = points[point[pairs]]
+            line = self.lane_map.lanes[self.ids[number]].centre
+            if np.ptp(line[:, 2]) == 0:
+                out[pairs] = np.abs(line[0, 2] - xyz[:, 2])
+                continue
+            out[pairs] = [_height_apart_m(line, place) for place in xyz]
+        return out
+
     def within(self, point: F64, radius_m: float) -> tuple[str, ...]:
-        """Return the lanes that have a centre vertex within ``radius_m``."""
+        """Return the lanes at the point's height that have a centre vertex within ``radius_m``."""
         if not self._kd:
             return ()
-        hits = self._kd[len(point)].query_ball_point(point, radius_m)
-        return tuple(self.ids[j] for j in np.unique(self._owner[np.asarray(hits, dtype=np.int64)]))
+        hits = np.asarray(self._kd[len(point)].query_ball_point(point, radius_m), dtype=np.int64)
+        if len(point) > 2:
+            hits = hits[np.abs(self._vertices[hits, 2] - point[2]) <= LEVEL_M]
+        return tuple(self.ids[j] for j in np.unique(self._owner[hits]))
 
     def heading_rad(self, lane_id: str, point: F64) -> float:
         """Return the driving direction of a lane at the place nearest to the point, in plan
@@ -150,6 +180,17 @@ class LaneIndex:
             inside = s < distance_m
             xyz = np.concatenate([xyz[inside], resample(xyz, [distance_m])])
         return LanePath(tuple(ids), xyz)
+
+
+def _height_apart_m(line: F64, point: F64) -> float:
+    """Return how far the middle ``(N, 3)`` of a lane is above or below a point ``(3,)``."""
+    if len(line) < 2:
+        return float(np.abs(line[0, 2] - point[2]))
+    _, share, offset = _on_segments(line, point[:2])
+    away_m = np.linalg.norm(offset, axis=1)
+    height_m = line[:-1, 2] + share * np.diff(line[:, 2])
+    is_near = away_m <= away_m.min() + NEAR_M
+    return float(np.abs(height_m[is_near] - point[2]).min())
 
 
 def _end_heading(line: F64, last: bool) -> float:
