@@ -114,7 +114,8 @@ class RoadForecast:
         yaw = float(yaw_of(T))
         lane = None
         if user.label not in WALKERS and user.speed_mps > MOVES_MPS:
-            lane = self._lane_of(T[:3, 3], float(np.arctan2(user.velocity[1], user.velocity[0])))
+            ground = T[:3, 3] - user.box.height_m / 2 * T[:3, 2]
+            lane = self._lane_of(ground, float(np.arctan2(user.velocity[1], user.velocity[0])))
         if lane is None:
             step = np.append(user.velocity, 0.0)
             return T[:3, 3] + TIMES_S[:, None] * step, np.full(len(TIMES_S), yaw)

@@ -4,12 +4,14 @@ The rule is a line to give way at, beside the light, for the lane that turns.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, heading_of, wrap_angle
 from alpasim_plugin.core.types import Lane, Signal
+from alpasim_plugin.world.ground import STACKED_M
 
 MEET_M = 2.0  # middles of lanes that come nearer than this meet
 ONCOMING_RAD = np.pi / 2  # between two approaches, at least
@@ -33,14 +35,15 @@ def turning_lines(lights: Sequence[Signal], lanes: Mapping[str, Lane]) -> tuple[
     ]
     if not ways:
         return ()
-    middles = [shapely.linestrings(lanes[key].centre[:, :2]) for _, key in ways]
+    middles = [shapely.linestrings(lanes[key].centre) for _, key in ways]
     out: dict[str, Signal] = {}
     meetings = shapely.STRtree(middles).query(middles, "dwithin", MEET_M)
     for first, second in meetings.T.tolist():
         light, key = ways[first]
         other, other_key = ways[second]
         goes_second = _detour(lanes[key], key) > _detour(lanes[other_key], other_key)
-        if goes_second and _oncoming(light, other) and green_together(light, other):
+        meet = _is_level(middles[first], middles[second])
+        if meet and goes_second and _oncoming(light, other) and green_together(light, other):
             out[key] = Signal(light.stop, light.heading_rad, (), name=light.name, lanes=(key,))
     return tuple(out.values())
 
@@ -59,6 +62,14 @@ def _detour(lane: Lane, key: str) -> tuple[bool, float, str]:
     ends = heading_of(np.diff(lane.centre[[0, 1, -2, -1]], axis=0)[[0, 2]])
     turns = abs(float(wrap_angle(ends[1] - ends[0]))) > STRAIGHT_RAD
     return turns, float(arc_lengths(lane.centre)[-1]), key
+
+
+def _is_level(middle: Any, other: Any) -> bool:
+    """Return whether lines in space are at one height where they are nearest in plan view."""
+    ends = shapely.points(shapely.get_coordinates(shapely.shortest_line(middle, other)))
+    lines = np.array([middle, other])
+    places = shapely.line_interpolate_point(lines, shapely.line_locate_point(lines, ends))
+    return float(np.ptp(shapely.get_z(places))) < STACKED_M
 
 
 def _oncoming(light: Signal, other: Signal) -> bool:

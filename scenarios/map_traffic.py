@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 from alpasim_plugin.core.types import LaneMap
+from alpasim_plugin.world.ground import STACKED_M
 from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
@@ -99,15 +100,17 @@ def stopping_m(speed_mps: float) -> float:
 
 
 def _too_close(ride: _Ride, other: _Ride) -> bool:
-    return float(np.hypot(*(ride.path.xyz[0] - other.path.xyz[0])[:2])) < ROOM_M
+    apart = ride.path.xyz[0] - other.path.xyz[0]
+    return float(np.hypot(*apart[:2])) < ROOM_M and abs(float(apart[2])) < STACKED_M
 
 
 def _is_ruled(ride: _Ride, other: _Ride) -> bool:
     """Return whether it is clear who goes first where two ways cross or join; from one lane on,
     they follow each other. Nobody drives against another one on one lane.
     """
-    tree = scipy.spatial.KDTree(other.path.xyz[::EVERY, :2])
-    apart_m, row = tree.query(ride.path.xyz[::EVERY, :2])
+    # In space: ways on a bridge and below it do not meet.
+    tree = scipy.spatial.KDTree(other.path.xyz[::EVERY])
+    apart_m, row = tree.query(ride.path.xyz[::EVERY])
     close = np.flatnonzero(apart_m < CLOSE_M)
     if not len(close):
         return True

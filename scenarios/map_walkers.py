@@ -9,6 +9,7 @@ import shapely
 
 from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import F64, I64, Actor, LaneMap
+from alpasim_plugin.world.ground import SLOPE, STACKED_M
 from alpasim_plugin.world.path import Path
 from alpasim_plugin.world.signals import lights_on
 from scenarios.ego_path import walk_track
@@ -42,18 +43,20 @@ def place_walkers(
         t_us: Times of their tracks.
         rng: Which crosswalks, sides, speeds and times.
     """
-    stops = [signal.stop.mean(axis=0)[:2] for signal in lane_map.signals or ()]
+    stops = [signal.stop.mean(axis=0) for signal in lane_map.signals or ()]
     lights = lights_on(driven, lane_map.signals, lane_map.lanes)
     points = shapely.points(driven.xyz[:, :2])
     places = []
     for ring in lane_map.crosswalks:
-        middle = ring[:-1].mean(axis=0)[:2]
-        inside = np.flatnonzero(shapely.contains(shapely.Polygon(ring[:, :2]), points))
+        middle = ring[:-1].mean(axis=0)
+        is_inside = shapely.contains(shapely.Polygon(ring[:, :2]), points)
+        is_level = np.abs(driven.xyz[:, 2] - middle[2]) < STACKED_M  # not of a bridge above the way
+        inside = np.flatnonzero(is_inside & is_level)
         if not len(inside) or driven.s[inside[0]] < FIRST_M:
             continue
         row = inside[len(inside) // 2]
         signals = [light.signal for light in lights if 0.0 <= driven.s[row] - light.s_m < LIGHT_M]
-        if signals or all(np.hypot(*(stop - middle)) >= LIGHT_M for stop in stops):
+        if signals or not any(_governs(stop, middle) for stop in stops):
             places.append((ring, row, signals))
     walkers = []
     for number, chosen in enumerate(rng.permutation(len(places))[:count]):
@@ -75,6 +78,13 @@ def place_walkers(
         track = walk_track(start, goal, t_us, begin_us, speed_mps, box)
         walkers.append(Actor(f"walker-{number}", "pedestrian", box, track))
     return walkers
+
+
+def _governs(stop: F64, middle: F64) -> bool:
+    """Return whether a light with a stop line at a place is one of a crosswalk at another place."""
+    away_m = float(np.hypot(*(stop - middle)[:2]))
+    rise_m = abs(float(stop[2] - middle[2]))
+    return away_m < LIGHT_M and rise_m < STACKED_M + SLOPE * away_m
 
 
 def _ends(ring: F64, heading_rad: float, height_m: float) -> tuple[F64, F64]:

@@ -1,5 +1,7 @@
 """The program that is assumed for the lights of a junction, and who waits where both have green."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,3 +129,12 @@ def test_a_light_of_the_road_before_the_junction_holds_the_turns_behind_it():
     heads = [head("east", "in"), head("west", "in")]
     lines = turning_lines(with_cycles(heads, {}), {**LANES, **roads})
     assert {key for line in lines for key in line.lanes} == {"east left", "west left"}
+
+
+def test_oncoming_traffic_on_another_level_is_not_waited_for():
+    def raised(key):
+        z = 6.0 * key.startswith("west")
+        return replace(LANES[key], centre=LANES[key].centre + np.array([0.0, 0.0, z]))
+
+    lines = turning_lines(with_cycles(EVERY_TURN, {}), {key: raised(key) for key in LANES})
+    assert {key for line in lines for key in line.lanes} == {"north left", "south left"}
