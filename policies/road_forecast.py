@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alpasim_plugin.core.geometry import direction_of, wrap_angle, yaw_of
+from alpasim_plugin.core.geometry import arc_lengths, direction_of, wrap_angle, yaw_of
 from alpasim_plugin.core.types import F64, Actor, Box, LaneMap
 from alpasim_plugin.world.path import Path, polyline_path
 from alpasim_plugin.world.route import LaneIndex
 from alpasim_plugin.world.signals import LightAhead, lights_on, red_gap_m
 from alpasim_plugin.world.yielding import TIMES_S, PredictedBodies
 
-AHEAD_M = 150.0  # of a lane, and of those that turn least behind it
+AHEAD_M = 150.0  # behind the end of a lane, along those that turn least
 ALONG_RAD = 0.5  # between a vehicle and the lane that it drives along, at most
 LATERAL_MPS = 0.3  # who moves sideways by less stays where it is in its lane
 MOVES_MPS = 0.5
@@ -131,9 +131,9 @@ class RoadForecast:
         if key is None or turns[key] > ALONG_RAD:
             return None
         if key not in self._ahead:
-            xyz_ahead = self._index.path_ahead(key, AHEAD_M).xyz
-            path = polyline_path(xyz_ahead)
             lanes = self._map.lanes
+            lane_m = float(arc_lengths(lanes[key].centre)[-1])
+            path = polyline_path(self._index.path_ahead(key, lane_m + AHEAD_M).xyz)
             self._ahead[key] = _LaneAhead(
                 path,
                 lights_on(path, self._map.signals, lanes),

@@ -167,3 +167,13 @@ def test_a_vehicle_is_expected_along_its_lane_and_before_its_red_light():
 def test_it_conforms():
     report = check_policy("rule-based", load_scenario("smoke/straight"))
     assert report.ok, str(report)
+
+
+@pytest.mark.parametrize("x_m", [20.0, 140.0, 160.0, 280.0])
+def test_a_car_is_expected_ahead_of_where_it_is_however_long_its_lane(x_m):
+    centre = np.column_stack([np.linspace(0.0, 400.0, 201), np.zeros(201), np.zeros(201)])
+    edges = (centre + np.array([0.0, 1.75, 0.0]), centre - np.array([0.0, 1.75, 0.0]))
+    forecast = RoadForecast(LaneMap({"long": Lane("long", centre, *edges)}))
+    user = RoadUser(se2(x_m, 0.0, 0.0, 0.75), CAR, np.array([10.0, 0.0]), "car")
+    ahead = forecast.predicted([user], 0)
+    assert ahead.xy[:, 0, 0] == pytest.approx(x_m + 10.0 * np.arange(0.0, 4.01, 0.5))
