@@ -174,7 +174,8 @@ def sentence(entry: Entry, length: str) -> str:
         f"{over.p_value:.3f}); without the one that moves it most, {over.family}, it is "
         f"{over.without_family:+.1f} points. For families that were not driven the interval is wide: "
         f"{over.bounds[0]:+.1f} to {over.bounds[1]:+.1f}. The rollouts were driven on {entry['date']} "
-        f"([closed loop](docs/experiments/fixer-closed-loop.md)).\n"
+        f"at commit {entry['commit']} and not again since, so that today's program may give other numbers "
+        "([closed loop](docs/experiments/fixer-closed-loop.md)).\n"
     )
 
 
