@@ -87,11 +87,29 @@ def signature(function: Any) -> str:
     """Return the parameters of a function as its source has them, a line each where they are many."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function))).body[0]
     assert isinstance(tree, ast.FunctionDef)
-    parameters = ast.unparse(tree.args)
+    parameters = ast.unparse(WithValues(function).visit(tree.args))
     result = f" -> {ast.unparse(tree.returns)}" if tree.returns is not None else ""
     if len(parameters) > 60:
         parameters = "\n    " + ",\n    ".join(_parted(parameters)) + ",\n"
     return f"({parameters}){result}"
+
+
+class WithValues(ast.NodeTransformer):
+    """Put the value of a constant of the function's module in place of its name, where it is a
+    number or a text; a reader of the page cannot look the name up.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self.constants = {
+            name: value
+            for name, value in vars(inspect.getmodule(function)).items()
+            if name.isupper() and isinstance(value, str | int | float)
+        }
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Return the value of a constant, or the name as it is."""
+        is_known = node.id in self.constants
+        return ast.Constant(self.constants[node.id]) if is_known else node
 
 
 def _parted(parameters: str) -> list[str]:
