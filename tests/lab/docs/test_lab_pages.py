@@ -8,6 +8,9 @@ import re
 import pytest
 
 from alpasim_plugin.cli.main import verbs
+from alpasim_plugin.lab.training import episode_references
+from alpasim_plugin.lab.training.map_errors import CHANCES
+from alpasim_plugin.lab.training.pixel_rollout import PixelObjectives
 from tests.docs import page_links as core
 from tests.docs.commands import LAB, LAB_VERBS, commands, lab_pages, pages
 from tests.docs.parsed_commands import needing_the_checkout, not_understood
@@ -74,3 +77,31 @@ def test_the_stages_on_the_page_of_the_systems_are_those_of_the_recipes(repo, mo
     for path, text in importlib.import_module("recipe_table").written().items():
         stale = f"{path.name} is stale: run python docs/scripts/recipe_table.py"
         assert path.read_text(encoding="utf-8") == text, stale
+
+
+def test_the_weights_of_the_terms_on_the_page_of_training_are_those_of_the_code(repo):
+    page = (repo / LAB / "training.md").read_text(encoding="utf-8")
+    weights = PixelObjectives()
+    for term in ("perceptual", "temporal", "grid", "choice", "flow"):
+        (said,) = re.findall(rf"^ {term} .*weight ([\d.]+)", page, re.M)
+        assert float(said) == getattr(weights, term), term
+
+
+def test_the_faults_of_inputs_on_the_page_of_training_are_those_of_the_code(repo):
+    page = (repo / LAB / "training.md").read_text(encoding="utf-8")
+    none, one, two, three = (f"{100 * chance:.0f} %" for chance in episode_references.COUNTS)
+    counts = f"none in {none} of the episodes, one in {one}, two in {two}, three in {three}"
+    assert counts in page
+    said = {
+        "the nearest ones missing": episode_references.P_SKIP,
+        "0.23 degrees": episode_references.P_MISPLACED,
+        "of another exposure": episode_references.P_EXPOSURE,
+        "of another place": episode_references.P_WRONG,
+        "| the map | missing": CHANCES["missing"],
+        "without lane markings": CHANCES["unpainted"],
+        "beside the road": CHANCES["shifted"],
+        "of another street": CHANCES["other"],
+    }
+    assert [
+        words for words, chance in said.items() if f"{words} ({100 * chance:.0f} %)" not in page
+    ] == []
