@@ -22,6 +22,8 @@ HORIZONS_S = (1, 2, 4)
 BRAKES_MPS = 0.5  # by which a plan that brakes is slower, one second ahead, than the ego is now
 BLOCK_S = 4.0  # plans overlap within it, so that what varies is a block of so long
 GAPS = tuple(f"{side}_{horizon_s}s_m" for horizon_s in HORIZONS_S for side in ("lateral", "along"))
+RANGE_STEP_M = 0.25  # between offsets at which the range of a built scene is looked for
+NEAR_M = 0.3  # across the plan, two seconds ahead
 BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
 
 
@@ -216,6 +218,41 @@ def gap_intervals(rows: Sequence[Row]) -> list[Row]:
                 "median_ci95": interval.bounds,
             }
             out.append({**dict(zip(keys, key, strict=True)), **values})
+    return out
+
+
+def is_near(row: Row) -> bool:
+    """Return whether plans are near those made of true images: their mean distance across, two seconds
+    ahead, is at most `NEAR_M`. False where plans are shorter than that.
+    """
+    gap_m = row["lateral_2s_m"]
+    return gap_m is not None and gap_m <= NEAR_M
+
+
+def gap_ranges(rows: Sequence[Row]) -> list[Row]:
+    """Return how far beside the path of a built scene plans are near, by drive, policy and renderer.
+
+    ``near_to_m`` is the largest offset up to which all offsets that were looked at are near; None
+    where those on the path are not. ``passes_at_m`` is the next one; None where none passes.
+
+    Args:
+        rows: Of `gap_rows`, with their offsets from 0 up in ``offset_m``.
+    """
+    keys = ("drive", "policy", "renderer")
+    out = []
+    for key in dict.fromkeys(tuple(row[name] for name in keys) for row in rows):
+        near_to_m = None
+        passes_at_m = None
+        for row in sorted(
+            (row for row in rows if tuple(row[name] for name in keys) == key),
+            key=lambda row: row["offset_m"],
+        ):
+            if not is_near(row):
+                passes_at_m = row["offset_m"]
+                break
+            near_to_m = row["offset_m"]
+        values = {"near_to_m": near_to_m, "passes_at_m": passes_at_m}
+        out.append({**dict(zip(keys, key, strict=True)), **values})
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +26,13 @@ from alpasim_plugin.core.types import U8, CameraSpec, Scenario
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
 from alpasim_plugin.lab.bench.open_loop import TrueImage, roles_of, sensors_of
-from alpasim_plugin.lab.bench.plan_gap import gap_intervals, gap_rows
+from alpasim_plugin.lab.bench.plan_gap import (
+    RANGE_STEP_M,
+    gap_intervals,
+    gap_ranges,
+    gap_rows,
+    is_near,
+)
 from alpasim_plugin.lab.bench.real import (
     Judges,
     Row,
@@ -53,9 +60,12 @@ Examples:
 - `simrun bench real runs/street --policy learned`: and how far its plans move
 
 - `simrun bench real hard/sharp_s_curve --policy learned --offsets 0,0.5,1`: in a built scene, beside its path
+
+- `simrun bench real hard/sharp_s_curve --policy learned --range`: how far beside it plans stay near
 """
 EVERY = 10  # frames between lines of progress
 MOST_OFFSET_M = 10.0
+RANGE_OFFSETS = 13  # up to 3 m
 TRUTH = "clean"  # of a built scene
 KEY_OF_TRUTH = "the truth"  # no name of a renderer
 
@@ -63,7 +73,9 @@ KEY_OF_TRUTH = "the truth"  # no name of a renderer
 def real(
     drives: Annotated[
         list[Path],
-        typer.Argument(help="Folders of imported drives, or their scenario files; see --offsets."),
+        typer.Argument(
+            help="Folders of imported drives, or built scenes: scenario files, names and logs."
+        ),
     ],
     renderers: Annotated[
         str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")
@@ -83,6 +95,13 @@ def real(
             help="Metres to the left of the path, for built scenes, whose truth is clean; by default 0.",
         ),
     ] = "",
+    find_range: Annotated[
+        bool,
+        typer.Option(
+            "--range",
+            help="Of built scenes: offsets of 0.25 m, up to where the plans' gap passes 0.3 m after two seconds.",
+        ),
+    ] = False,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Seed of the noise of fixers and policies.")
     ] = 0,
@@ -117,8 +136,9 @@ def real(
     )
     scenarios = _loaded(drives)
     built = {name: drive for name, drive in scenarios.items() if drive.model is None}
-    offsets_m = _offsets(offsets)
-    _refuse_mixtures(scenarios, built, bench.policies, offsets)
+    offsets_m = _offsets(offsets, find_range)
+    offset_option = "--range" if find_range else f"--offsets {offsets}" if offsets else ""
+    _refuse_mixtures(scenarios, built, bench.policies, offset_option)
     recorded = {name: drive for name, drive in scenarios.items() if name not in built}
     # What cannot be measured is refused before anything is rendered.
     for scenario in recorded.values():
@@ -127,7 +147,8 @@ def real(
     images, gaps = bench.measure_recorded(recorded)
     for name, scenario in built.items():
         gaps += bench.measure_built(name, scenario, offsets_m)
-    _say(images, gaps, len(scenarios), as_json, console)
+    ranges = gap_ranges(gaps) if find_range else []
+    _say(images, gaps, ranges, len(scenarios), as_json, console)
 
 
 @dataclass(frozen=True)
@@ -183,25 +204,36 @@ class _Bench:
         )
 
     def measure_built(
-        self, name: str, scenario: Scenario, offsets_m: Sequence[float]
+        self, name: str, scenario: Scenario, offsets: Offsets
     ) -> list[dict[str, Any]]:
-        """Return the rows of plans of a built scene, at every offset from its path."""
+        """Return the rows of plans of a built scene at offsets from its path; of a range, until the
+        plans behind no renderer are near those behind the truth.
+        """
+        rows: list[dict[str, Any]] = []
+        for offset_m in offsets.metres:
+            rows_here = self._at_offset(name, scenario, offset_m)
+            rows += [{**row, "offset_m": offset_m} for row in rows_here]
+            if offsets.is_range and not any(is_near(row) for row in rows_here):
+                break
+        return rows
+
+    def _at_offset(self, name: str, scenario: Scenario, offset_m: float) -> list[dict[str, Any]]:
+        cameras = {policy.name: _cameras_of(policy, scenario) for policy in self.policies}
+        requests = {
+            camera.name: offset_requests(scenario, camera, offset_m)
+            for camera in itertools.chain.from_iterable(cameras.values())
+        }
+        makers = {
+            **self._makers(scenario),
+            KEY_OF_TRUTH: self._maker(resolve_renderer(TRUTH), scenario),
+        }
+        subject = f"{name}, {offset_m:g} m"
+        rendered = rendered_images(makers, requests, partial(_tell, self.console, subject))
+        series = drawn_series(requests, rendered.pop(KEY_OF_TRUTH), offset_m)
         rows = []
-        for offset_m in offsets_m:
-            for policy in self.policies:
-                cameras = _cameras_of(policy, scenario)
-                requests = {
-                    camera.name: offset_requests(scenario, camera, offset_m) for camera in cameras
-                }
-                truth = resolve_renderer(TRUTH)
-                makers = {**self._makers(scenario), KEY_OF_TRUTH: self._maker(truth, scenario)}
-                subject = f"{name}, {offset_m:g} m"
-                rendered = rendered_images(makers, requests, partial(_tell, self.console, subject))
-                series = drawn_series(requests, rendered.pop(KEY_OF_TRUTH), offset_m)
-                rows += [
-                    {**row, "offset_m": offset_m}
-                    for row in self._gaps_of(policy, name, scenario, series, rendered)
-                ]
+        for policy in self.policies:
+            policy_series = {camera.name: series[camera.name] for camera in cameras[policy.name]}
+            rows += self._gaps_of(policy, name, scenario, policy_series, rendered)
         return rows
 
     def _gaps(
@@ -239,6 +271,7 @@ class _Bench:
 def _say(
     images: Sequence[Row],
     gaps: Sequence[dict[str, Any]],
+    ranges: Sequence[dict[str, Any]],
     drives: int,
     as_json: bool,
     console: Console,
@@ -254,6 +287,7 @@ def _say(
         "intervals": intervals(images),
         "plan_gap": gaps,
         "plan_gap_intervals": gap_intervals(gaps),
+        "plan_gap_range": ranges,
     }
     if as_json:
         say_document({name: rows for name, rows in parts.items() if rows})
@@ -305,7 +339,7 @@ def _refuse_mixtures(
     policies: Sequence[PartSpec],
     offsets: str,
 ) -> None:
-    """Refuse built scenes without a policy, and offsets of recorded drives.
+    """Refuse built scenes without a policy, and options for offsets of recorded drives.
 
     Raises:
         InputError: There are such.
@@ -319,17 +353,36 @@ def _refuse_mixtures(
     recorded = [name for name in scenarios if name not in built]
     if offsets and recorded:
         raise InputError(
-            f"--offsets {offsets}: {recorded[0]} is a recorded drive: it has photographs where its cameras were, and no others",
-            "leave --offsets out, or give built scenes",
+            f"{offsets}: {recorded[0]} is a recorded drive: it has photographs where its cameras were, and no others",
+            "leave it out, or give built scenes",
         )
 
 
-def _offsets(text: str) -> list[float]:
-    """Return metres from their text.
+@dataclass(frozen=True)
+class Offsets:
+    """Where built scenes are looked at.
+
+    Attributes:
+        metres: To the left of the path, in order.
+        is_range: Whether it ends where plans are no longer near.
+    """
+
+    metres: Sequence[float]
+    is_range: bool
+
+
+def _offsets(text: str, find_range: bool) -> Offsets:
+    """Return offsets from their text, or those that find a range.
 
     Raises:
-        InputError: One is no number, twice there, or too large.
+        InputError: One is no number, twice there, or too large; or both are asked for.
     """
+    if find_range:
+        if text:
+            raise InputError(
+                f"--offsets {text}: --range chooses its own offsets", "leave one of the two out"
+            )
+        return Offsets([RANGE_STEP_M * number for number in range(RANGE_OFFSETS)], True)
     try:
         offsets_m = [float(part) for part in text.split(",")] if text else [0.0]
     except ValueError:
@@ -343,7 +396,7 @@ def _offsets(text: str) -> list[float]:
             f"--offsets {text}: not numbers, each once and at most {MOST_OFFSET_M:g} m",
             "write for example 0,0.25,0.5",
         )
-    return offsets_m
+    return Offsets(offsets_m, False)
 
 
 def _range_text(bounds: Sequence[float] | None) -> str | None:
@@ -353,7 +406,8 @@ def _range_text(bounds: Sequence[float] | None) -> str | None:
 def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
     out: dict[str, Scenario] = {}
     for drive in drives:
-        file = drive / "scenario.yaml" if drive.is_dir() else drive
+        imported = drive / "scenario.yaml"
+        file = imported if imported.is_file() else drive
         scenario = load_scenario(str(file))
         name = scenario.scene_id if scenario.model is None else file.parent.name
         if name in out:

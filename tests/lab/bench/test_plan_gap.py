@@ -4,6 +4,7 @@ frame, and what is refused.
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +18,13 @@ from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
 from alpasim_plugin.lab.bench.open_loop import TrueImage, plans_of, roles_of
 from alpasim_plugin.lab.bench.plan_gap import (
     BLOCK_S,
+    GAPS,
     brakes,
     gap_intervals,
     gap_of,
+    gap_ranges,
     gap_rows,
+    is_near,
     pose_at,
 )
 from alpasim_plugin.lab.bench.real import series_of, shots_of
@@ -316,3 +320,76 @@ def test_offsets_that_are_none_are_refused(offsets, capsys):
 def test_a_built_scene_needs_a_policy(capsys):
     assert run_command(["bench", "real", "hard/sharp_s_curve"]) == 2
     assert "no photographs" in capsys.readouterr().err
+
+
+def offset_row(offset_m, gap_m, renderer="3dgs", drive="d"):
+    return {
+        "drive": drive,
+        "policy": "p",
+        "renderer": renderer,
+        "set": "drawn",
+        "n_plans": 1,
+        "offset_m": offset_m,
+        **dict.fromkeys((*GAPS, "brakes_in_one")),
+        "lateral_2s_m": gap_m,
+    }
+
+
+def test_a_range_ends_before_the_first_offset_whose_plans_are_not_near():
+    rows = [offset_row(0.25 * number, gap_m) for number, gap_m in enumerate([0.1, 0.3, 0.31, 0.1])]
+    assert gap_ranges(rows[::-1]) == [
+        {"drive": "d", "policy": "p", "renderer": "3dgs", "near_to_m": 0.25, "passes_at_m": 0.5}
+    ]
+
+
+@pytest.mark.parametrize(
+    ("gaps_m", "near_to_m", "passes_at_m"),
+    [([0.5, 0.1], None, 0.0), ([0.1, 0.2], 0.25, None), ([0.1, None], 0.0, 0.25)],
+)
+def test_a_range_may_not_begin_and_may_not_end(gaps_m, near_to_m, passes_at_m):
+    rows = [offset_row(0.25 * number, gap_m) for number, gap_m in enumerate(gaps_m)]
+    (row,) = gap_ranges(rows)
+    assert (row["near_to_m"], row["passes_at_m"]) == (near_to_m, passes_at_m)
+    assert not is_near(offset_row(0.0, None))
+
+
+def test_every_drive_and_renderer_has_a_range_of_its_own():
+    rows = [offset_row(0.0, 0.1), offset_row(0.0, 0.4, "onefixer"), offset_row(0.0, 0.4, drive="e")]
+    assert [row["near_to_m"] for row in gap_ranges(rows)] == [0.0, None, None]
+
+
+def test_a_range_is_looked_for_until_no_renderer_is_near(drive, monkeypatch, capsys):
+    built = replace(drive, model=None)
+    monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": built})
+    looked_at = []
+
+    def rows_at(bench, name, scenario, offset_m):
+        looked_at.append(offset_m)
+        return [offset_row(offset_m, 0.2 + offset_m), offset_row(offset_m, 0.39 * offset_m, "x")]
+
+    monkeypatch.setattr(bench_real._Bench, "_at_offset", rows_at)
+    command = ["bench", "real", "d", "--renderer", "3dgs", "--policy", f"{HERE}:Steers"]
+    assert run_command([*command, "--range", "--json"]) == 0
+    assert looked_at == [0.0, 0.25, 0.5, 0.75, 1.0]
+    ranges = json.loads(capsys.readouterr().out)["plan_gap_range"]
+    assert [row["near_to_m"] for row in ranges] == [0.0, 0.75]
+    assert run_command([*command, "--range", "--offsets", "0,1"]) == 2
+    assert "chooses its own offsets" in capsys.readouterr().err
+    monkeypatch.setattr(bench_real, "_loaded", lambda drives: {"d": drive})
+    assert run_command([*command, "--range"]) == 2
+    assert "recorded drive" in capsys.readouterr().err
+
+
+def test_a_log_is_named_by_its_folder_as_a_scene_to_drive_is(tmp_path, monkeypatch):
+    loaded = []
+    monkeypatch.setattr(
+        bench_real,
+        "load_scenario",
+        lambda name: loaded.append(name) or SimpleNamespace(scene_id="s", model=None),
+    )
+    (tmp_path / "log").mkdir()
+    (tmp_path / "street").mkdir()
+    (tmp_path / "street" / "scenario.yaml").touch()
+    bench_real._loaded([tmp_path / "log"])
+    bench_real._loaded([tmp_path / "street"])
+    assert loaded == [str(tmp_path / "log"), str(tmp_path / "street" / "scenario.yaml")]
