@@ -10,7 +10,7 @@ shown to be the other way round, and is undecided otherwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -164,7 +164,7 @@ class Design:
 
 
 def expected(
-    claim: Claim, design: Design, pilot: Quality, drive: ClosedLoop, least: float
+    claim: Claim, design: Design, pilot: Quality, drive_spreads: Mapping[str, float], least: float
 ) -> Expected:
     """Return the power of a claim, and why it is left out if it is.
 
@@ -173,7 +173,8 @@ def expected(
         design: What is measured.
         pilot: Open-loop quality of a small measurement. Of a metric the largest spread among its
             pairs of fixers counts.
-        drive: Closed loop of a small measurement.
+        drive_spreads: Of differences from the raw render in a small closed loop, by metric of the
+            paper (`records.read_drive_spreads`).
         least: Claims of less power are left out.
     """
     if claim.missing:
@@ -184,7 +185,7 @@ def expected(
     powers = []
     for metric in claim.metrics:
         spread = (
-            drive_spread(drive, metric)
+            drive_spreads.get(metric)
             if claim.drive
             else quality_spread(pilot, metric, RAW in claim.rows)
         )
@@ -217,17 +218,6 @@ def quality_spread(pilot: Quality, metric: str, with_raw: bool) -> float | None:
         float(np.std(differences, ddof=1))
         for name, other in combinations(names, 2)
         if len(differences := pilot.differences(name, other, ours)) > 1
-    ]
-    return max(spreads, default=None)
-
-
-def drive_spread(drive: ClosedLoop, metric: str) -> float | None:
-    """Return the largest spread between scenes of a difference from the raw render."""
-    spreads = [
-        entry.spread
-        for table in drive.minus_raw.values()
-        for ours in printed().metrics[metric].ours
-        if (entry := table.get(ours)) is not None and entry.spread
     ]
     return max(spreads, default=None)
 

@@ -72,7 +72,10 @@ class Pilot(_Strict):
     """Records of a small measurement whose spread gives the power of the claims."""
 
     quality: str = Field(description="A quality.json, relative to this file.")
-    drive: str | None = Field(default=None, description="A summary.json, relative to this file.")
+    drive: str | None = Field(
+        default=None,
+        description="A summary.json, or a document of simrun compare --json, relative to this file.",
+    )
 
 
 class PaperConfig(_Strict):

@@ -27,6 +27,7 @@ from alpasim_plugin.lab.paper.records import (
     ClosedLoop,
     Quality,
     read_closed_loop,
+    read_drive_spreads,
     read_quality,
 )
 from alpasim_plugin.lab.paper.stages import Placed, place
@@ -87,14 +88,15 @@ def experiment(
     stages = place(comparison(config, weights, effort), out)
     folder = document.folder_of(("pilot",))
     pilot = read_quality([folder / config.pilot.quality])
-    drive = ClosedLoop()
+    drive_spreads: dict[str, float] = {}
     if config.pilot.drive is not None:
-        drive = read_closed_loop(folder / config.pilot.drive)
+        drive_spreads = read_drive_spreads(folder / config.pilot.drive)
     scenes = sum(item.scenes for item in config.drive.scenes) if config.drive else 0
     rows = frozenset(drive_rows(config)) if config.drive else frozenset()
     design = Design(frozenset(config.labels), config.test.scenes, rows, scenes)
     expectations = tuple(
-        expected(claim, design, pilot, drive, config.least_power) for claim in claims().claims
+        expected(claim, design, pilot, drive_spreads, config.least_power)
+        for claim in claims().claims
     )
     return Experiment(config, out, tuple(stages), expectations)
 

@@ -14,6 +14,7 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_json_object
 from alpasim_plugin.core.types import F64
+from alpasim_plugin.lab.paper.printed import printed
 from evaluators.results import Difference, Mean, read_summary
 
 QUALITY_FILE = "quality.json"
@@ -75,20 +76,49 @@ def read_quality(files: Sequence[Path]) -> Quality:
     return Quality(by_scene, sets)
 
 
-def read_closed_loop(path: Path, rows: Sequence[str] | None = None) -> ClosedLoop:
+def read_drive_spreads(path: Path) -> dict[str, float]:
+    """Return the largest spread between scenes of a paired difference, by metric of the paper.
+
+    A metric without a spread, such as an event that no rollout had, is left out: it says nothing
+    of other scenes.
+
+    Args:
+        path: ``summary.json`` of a run, or the document of ``simrun compare --json``.
+
+    Raises:
+        InputError: No such file, or no paired differences in it.
+    """
+    record = read_json_object(path)
+    if not record.get("paired"):
+        raise InputError(
+            f"{path}: no paired differences",
+            "Name the summary.json of a run with a baseline, or a document of 'simrun compare --json'.",
+        )
+    spreads: dict[str, float] = {}
+    for name, facts in printed().metrics.items():
+        values = [
+            float(table[ours]["spread"])
+            for table in record["paired"].values()
+            for ours in facts.ours
+            if ours in table and table[ours]["spread"]
+        ]
+        if values:
+            spreads[name] = max(values)
+    return spreads
+
+
+def read_closed_loop(path: Path, rows: Sequence[str]) -> ClosedLoop:
     """Read the summary of a run.
 
     Args:
         path: Its ``summary.json``.
-        rows: Names in the table, in the order of the run's renderers, the raw render first; None:
-            the renderers keep theirs.
+        rows: Names in the table, in the order of the run's renderers, the raw render first.
 
     Raises:
         InputError: It does not hold as many renderers.
     """
     summary = read_summary(path, "Drive it again.")
     names = list(summary.metrics)
-    rows = names if rows is None else rows
     if len(names) != len(rows):
         raise InputError(
             f"{path}: renderers {', '.join(names)}; wanted {', '.join(rows)}",

@@ -1,9 +1,12 @@
 """Claims as comparisons: power before, verdict afterwards, and what the shipped files say."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy import stats
 
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.lab.paper.claims import (
     Claim,
@@ -20,7 +23,7 @@ from alpasim_plugin.lab.paper.claims import (
 )
 from alpasim_plugin.lab.paper.config import RAW, system_of
 from alpasim_plugin.lab.paper.printed import printed
-from alpasim_plugin.lab.paper.records import ClosedLoop, Quality
+from alpasim_plugin.lab.paper.records import ClosedLoop, Quality, read_drive_spreads
 from alpasim_plugin.lab.training.recipes.registry import RECIPES
 from alpasim_plugin.lab.video_metrics.facts import FACTS, SET_TITLES
 from evaluators.metrics import METRICS
@@ -73,18 +76,36 @@ def test_weak_claims_are_left_out_and_say_their_power():
     rng = stream("", 1, "tests/pilot")
     pilot = record(a=rng.normal(0, 0.1, 12), b=rng.normal(0, 0.1, 12))
     design = Design(frozenset({"V9", "V1"}), 24, frozenset(), 0)
-    strong = expected(claim(), design, pilot, ClosedLoop(), 0.5)
+    strong = expected(claim(), design, pilot, {}, 0.5)
     assert strong.left_out == ""
     assert strong.power > 0.9
     noisy = record(a=rng.normal(0, 5, 12), b=rng.normal(0, 5, 12))
-    weak = expected(claim(), design, noisy, ClosedLoop(), 0.5)
+    weak = expected(claim(), design, noisy, {}, 0.5)
     assert weak.power < 0.5
     assert weak.left_out == f"its power is {100 * weak.power:.0f} %"
-    absent = expected(claim(than=("V2",)), design, pilot, ClosedLoop(), 0.5)
+    absent = expected(claim(than=("V2",)), design, pilot, {}, 0.5)
     assert absent.left_out == "not among the rows: V2"
-    unmeasured = expected(claim(metrics=("dists",)), design, pilot, ClosedLoop(), 0.5)
+    unmeasured = expected(claim(metrics=("dists",)), design, pilot, {}, 0.5)
     assert unmeasured.left_out == "the pilot says no spread of dists"
     assert decide(weak, pilot, ClosedLoop()).verdict is None
+
+
+def test_a_claim_about_drives_needs_a_spread_of_drives(tmp_path):
+    path = tmp_path / "compare.json"
+    entries = {"route_distance_m": {"spread": 0.3}, "collision_at_fault": {"spread": 0.0}}
+    path.write_text(json.dumps({"paired": {"onefixer": entries}}))
+    spreads = read_drive_spreads(path)
+    assert spreads == {"route_distance_m": 0.3}  # no event says nothing of other scenes
+    design = Design(frozenset(), 0, frozenset({"V9", RAW}), 60)
+    on_the_road = claim(drive=True, than=(RAW,), metrics=("route_distance_m",))
+    got = expected(on_the_road, design, record(), spreads, 0.5)
+    assert got.power == pytest.approx(mean_test_power(0.3, 0.1, 60, 1))
+    unhurt = claim(drive=True, than=(RAW,), metrics=("collision_percent",))
+    got = expected(unhurt, design, record(), spreads, 0.5)
+    assert got.left_out == "the pilot says no spread of collision_percent"
+    path.write_text("{}")
+    with pytest.raises(InputError, match="no paired differences"):
+        read_drive_spreads(path)
 
 
 def test_a_claim_holds_fails_or_stays_open_by_the_signs_of_its_scenes():
