@@ -12,14 +12,20 @@ import typer
 from rich.console import Console
 
 from alpasim_plugin.cli.main import load_verb
-from alpasim_plugin.core.errors import InfrastructureError, Stopped
+from alpasim_plugin.core.errors import InfrastructureError, InputError, Stopped
 from alpasim_plugin.core.files.config import Document
 from alpasim_plugin.core.files.lock import one_writer
 from alpasim_plugin.core.printing import say, say_document
 from alpasim_plugin.lab.cli.training_options import AsJson, Debug, Device
 from alpasim_plugin.lab.paper.comparison import Effort
 from alpasim_plugin.lab.paper.config import PaperConfig, load_config
-from alpasim_plugin.lab.paper.experiment import PAGE_FILE, Experiment, experiment, write_results
+from alpasim_plugin.lab.paper.experiment import (
+    PAGE_FILE,
+    Experiment,
+    experiment,
+    keep_weights,
+    write_results,
+)
 from alpasim_plugin.lab.paper.stages import Placed, State, run_stages
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 
@@ -28,7 +34,9 @@ Examples:
 
 - `simrun bench paper --config small --out runs/paper --dry-run`
 
-- `simrun bench paper --config small --out runs/paper --jobs 2`
+- `simrun bench paper --config small --out runs/paper --jobs 2 --keep-weights weights`
+
+- `simrun bench paper --config small --out runs/again --weights weights`: the same numbers without training
 """
 LOCK_FILE = ".lock"
 
@@ -47,6 +55,18 @@ MetricWeights = Annotated[
         "--metric-weights", help=f"Folder of the metrics' weights; also {FOLDER_VARIABLE}."
     ),
 ]
+KeepWeights = Annotated[
+    Path | None,
+    typer.Option(
+        "--keep-weights", help="Copy the trained systems into this folder, SYSTEM.safetensors each."
+    ),
+]
+Weights = Annotated[
+    Path | None,
+    typer.Option(
+        "--weights", help="Folder of --keep-weights: train nothing, measure and drive these."
+    ),
+]
 Jobs = Annotated[
     int, typer.Option("--jobs", min=1, help="Processes of rendering, measuring and driving.")
 ]
@@ -57,6 +77,8 @@ def paper(
     config: Config,
     out: Out,
     dry_run: DryRun = False,
+    weights: Weights = None,
+    keep: KeepWeights = None,
     metric_weights: MetricWeights = None,
     device: Device = "cpu",
     threads: Threads = 1,
@@ -72,8 +94,10 @@ def paper(
     """
     del debug
     read, document, _ = load_config(config)
-    weights = weights_of(read, document, metric_weights)
-    ready = experiment(read, document, out, weights, Effort(device, threads, jobs))
+    if weights is not None and keep is not None:
+        raise InputError("--weights and --keep-weights: nothing is trained", "Give one of them.")
+    networks = weights_of(read, document, metric_weights)
+    ready = experiment(read, document, out, networks, Effort(device, threads, jobs), weights)
     if not as_json:
         say(*plan_lines(ready))
     if dry_run:
@@ -94,6 +118,8 @@ def paper(
             stop.kept = f"complete stages are kept in {out}; the same command continues"
             raise
         record = write_results(ready)
+        if keep is not None:
+            keep_weights(ready, keep)
     if as_json:
         say_document(record)
     else:

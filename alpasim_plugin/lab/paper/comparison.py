@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.lab.bench.quality import VERSION, metric_digests
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig, SceneSet, system_of
@@ -59,29 +62,76 @@ def train_name(system: str) -> str:
     return f"train-{system}"
 
 
-def comparison(config: PaperConfig, weights: Path | None, effort: Effort) -> list[Stage]:
+@dataclass(frozen=True)
+class Network:
+    """Where a system's weights come from.
+
+    Attributes:
+        path: The bundle, or a placeholder for the folder of the stage that trains it and its name.
+        reads: That stage; none where the weights are given.
+        digests: SHA-256 of given weights by system.
+    """
+
+    path: str
+    reads: tuple[str, ...] = ()
+    digests: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+
+def network_of(system: str, kept: Path | None) -> Network:
+    """Return a system's weights: those of the stage that trains it, or kept ones.
+
+    Args:
+        system: The recipe.
+        kept: Folder of `keep_weights`; None: the system is trained.
+
+    Raises:
+        InputError: The folder does not have them.
+    """
+    if kept is None:
+        name = train_name(system)
+        return Network(f"{{{name}}}/{BUNDLE}", (name,))
+    path = kept / f"{system}.safetensors"
+    if not path.is_file():
+        raise InputError(
+            f"--weights {kept}: no {path.name}",
+            "Name a folder that --keep-weights has filled with the same configuration.",
+        )
+    return Network(str(path), digests={system: file_sha256(path)})
+
+
+def comparison(
+    config: PaperConfig, weights: Path | None, effort: Effort, kept: Path | None = None
+) -> list[Stage]:
     """Return the stages, each after those that it reads.
 
     Args:
         config: What is compared, at which budget.
         weights: Folder of the metrics' weights.
         effort: How the commands are run.
+        kept: Folder of trained systems, which are then not trained; None: all are.
+
+    Raises:
+        InputError: The folder lacks a system.
     """
-    stages = [
-        *_pairs(PAIRS_TRAIN, config.train, effort),
-        *_pairs(PAIRS_TEST, config.test, effort),
-        _autoencoder(config, effort),
-    ]
+    stages = [] if kept is not None else _trainings(config, effort)
+    stages += _pairs(PAIRS_TEST, config.test, effort)
+    for label in config.labels:
+        network = Network("") if label == RAW else network_of(system_of(label), kept)
+        stages.append(_quality(label, config, network, weights, effort))
+    if config.drive is not None:
+        stages += _drives(config, effort, kept)
+    return stages
+
+
+def _trainings(config: PaperConfig, effort: Effort) -> list[Stage]:
+    """Return the stages that end with the weights of all systems."""
+    stages = [*_pairs(PAIRS_TRAIN, config.train, effort), _autoencoder(config, effort)]
     systems = systems_of(config)
     needed = {source for system in systems for source in _inits(recipe_of(system))}
     for base, source in ((BASE, INIT), (BASE_BI, INIT_BI)):
         if source in needed:
             stages.append(_base(base, config, effort))
-    stages += [_system(system, config, effort) for system in systems]
-    stages += [_quality(label, config, weights, effort) for label in config.labels]
-    if config.drive is not None:
-        stages += _drives(config, effort)
-    return stages
+    return stages + [_system(system, config, effort) for system in systems]
 
 
 def systems_of(config: PaperConfig) -> list[str]:
@@ -204,9 +254,10 @@ def _system(system: str, config: PaperConfig, effort: Effort) -> Stage:
     )
 
 
-def _quality(label: str, config: PaperConfig, weights: Path | None, effort: Effort) -> Stage:
-    system = system_of(label)
-    fixer = label if label == RAW else f"{label}={{{train_name(system)}}}/{BUNDLE}"
+def _quality(
+    label: str, config: PaperConfig, network: Network, weights: Path | None, effort: Effort
+) -> Stage:
+    fixer = label if label == RAW else f"{label}={network.path}"
     words = ["bench", "quality", f"{{{PAIRS_TEST}}}", "--split", config.test.split]
     words += ["--fixer", fixer, "--baseline", label, "--frames", str(config.frames)]
     words += ["--pictures", "0", "--out", "{out}"]
@@ -218,19 +269,25 @@ def _quality(label: str, config: PaperConfig, weights: Path | None, effort: Effo
     return Stage(
         quality_name(label),
         tuple(words),
-        (PAIRS_TEST,) if label == RAW else (PAIRS_TEST, train_name(system)),
-        {"version": VERSION, "networks": metric_digests(weights)},
+        (PAIRS_TEST, *network.reads),
+        {
+            "version": VERSION,
+            "networks": metric_digests(weights),
+            "weights": dict(network.digests),
+        },
         tuple(extra),
         f"{config.test.scenes} clips of up to {config.frames} frames",
     )
 
 
-def _drives(config: PaperConfig, effort: Effort) -> list[Stage]:
+def _drives(config: PaperConfig, effort: Effort, kept: Path | None) -> list[Stage]:
     drive = config.drive
     assert drive is not None
     sets = {f"scenes-{DRIVE}-{i}": scenes for i, scenes in enumerate(drive.scenes)}
     rows = [row for row in drive.renderers if row != RAW]
-    words = ["run", "--renderer", ",".join([RAW, *(_renderer(row) for row in rows)])]
+    networks = {row: network_of(system_of(row), kept) for row in rows}
+    renderers = [_renderer(row, networks[row]) for row in rows]
+    words = ["run", "--renderer", ",".join([RAW, *renderers])]
     words += ["--baseline", RAW, "--policy", drive.policy, "--seeds", str(drive.seeds)]
     words += ["--preset", drive.preset, "--images", "none", "--out", f"{{out}}/{RUN}"]
     words += [f"{{{name}}}/{scenes.split}" for name, scenes in sets.items()]
@@ -238,8 +295,11 @@ def _drives(config: PaperConfig, effort: Effort) -> list[Stage]:
     run = Stage(
         DRIVE,
         tuple(words),
-        (*sets, *dict.fromkeys(train_name(system_of(row)) for row in rows)),
-        {"program": package_digest()},  # a run reuses no rollout of another program either
+        (*sets, *dict.fromkeys(name for network in networks.values() for name in network.reads)),
+        {
+            "program": package_digest(),  # a run reuses no rollout of another program either
+            "weights": {row: dict(network.digests) for row, network in networks.items()},
+        },
         ("--workers", str(effort.jobs), "--device", effort.device),
         f"{len(rows) + 1} renderers, {count} scenes, {drive.seeds} seeds",
     )
@@ -252,11 +312,10 @@ def drive_rows(config: PaperConfig) -> list[str]:
     return [RAW, *(row for row in rows if row != RAW)]
 
 
-def _renderer(row: str) -> str:
-    system = system_of(row)
+def _renderer(row: str, network: Network) -> str:
     steps = row.partition("@")[2]
-    bundle = f"[weights.bundle={{{train_name(system)}}}/{BUNDLE}]"
-    return f"{recipe_of(system).fixer}{bundle}{'@' + steps if steps else ''}+{RAW}"
+    bundle = f"[weights.bundle={network.path}]"
+    return f"{recipe_of(system_of(row)).fixer}{bundle}{'@' + steps if steps else ''}+{RAW}"
 
 
 def _updates(count: int) -> str:

@@ -6,18 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alpasim_plugin.core.files.atomic import write_json, write_text
+from alpasim_plugin.core.files import read_bytes
+from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.files.config import Document
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.lab.paper import tables
 from alpasim_plugin.lab.paper.claims import Decided, Design, Expected, claims, decide, expected
 from alpasim_plugin.lab.paper.comparison import (
+    BUNDLE,
     DRIVE,
     RUN,
     Effort,
     comparison,
     drive_rows,
     quality_name,
+    systems_of,
+    train_name,
 )
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig
 from alpasim_plugin.lab.paper.printed import printed
@@ -71,7 +75,12 @@ class Experiment:
 
 
 def experiment(
-    config: PaperConfig, document: Document, out: Path, weights: Path | None, effort: Effort
+    config: PaperConfig,
+    document: Document,
+    out: Path,
+    weights: Path | None,
+    effort: Effort,
+    kept: Path | None = None,
 ) -> Experiment:
     """Return the experiment that a configuration describes; nothing is run.
 
@@ -81,11 +90,12 @@ def experiment(
         out: Folder of everything that is written.
         weights: Folder of the metrics' weights.
         effort: How the commands are run.
+        kept: Folder of trained systems, which are then not trained.
 
     Raises:
-        InputError: The pilot is not there, or of another program.
+        InputError: The pilot is not there, or of another program; or a kept system is missing.
     """
-    stages = place(comparison(config, weights, effort), out)
+    stages = place(comparison(config, weights, effort, kept), out)
     folder = document.folder_of(("pilot",))
     pilot = read_quality([folder / config.pilot.quality])
     drive_spreads: dict[str, float] = {}
@@ -128,6 +138,25 @@ def write_results(ready: Experiment) -> JsonObject:
     write_json(ready.out / RECORD_FILE, record)
     write_text(ready.out / PAGE_FILE, _page(ready, cells, decided))
     return record
+
+
+def keep_weights(ready: Experiment, folder: Path) -> list[Path]:
+    """Copy the bundle and the card of every trained system into a folder, and return the bundles.
+
+    Raises:
+        InputError: A system is not trained.
+    """
+    folders = {item.stage.name: item.folder for item in ready.stages}
+    copies = []
+    for system in systems_of(ready.config):
+        trained = folders[train_name(system)] / BUNDLE
+        copies.append(folder / f"{system}.safetensors")
+        for source, target in (
+            (trained, copies[-1]),
+            (trained.with_suffix(".card.json"), folder / f"{system}.card.json"),
+        ):
+            write_bytes(target, read_bytes(source))
+    return copies
 
 
 def _cells(config: PaperConfig, quality: Quality, drive: ClosedLoop) -> JsonObject:

@@ -84,7 +84,8 @@ def test_a_stopped_comparison_goes_on_and_another_budget_remakes_what_depends_on
     assert begun["train-V9"] == "begun"
     assert begun["quality-V9"] == "open"
 
-    assert paper(tmp_path, "--json") == 0
+    kept = tmp_path / "kept"
+    assert paper(tmp_path, "--json", "--keep-weights", str(kept)) == 0
     out, err = capsys.readouterr()
     said = err.replace("\n", "")
     record = json.loads(out)
@@ -106,12 +107,29 @@ def test_a_stopped_comparison_goes_on_and_another_budget_remakes_what_depends_on
     assert gap["comparisons"][0]["n"] == 2
     assert (tmp_path / "o" / "paper.md").read_text().count("| V2 |") == 1
 
+    assert sorted(path.name for path in kept.glob("*.safetensors")) == [
+        "V2.safetensors",
+        "V9.safetensors",
+    ]
+    assert paper(tmp_path, "--json", "--weights", str(kept)) == 0
+    repeated = json.loads(capsys.readouterr().out)
+    assert not [stage for stage in repeated["stages"] if stage["name"].startswith("train-")]
+    assert repeated["tables"]["cycle"]["V9"]["lpips"] == record["tables"]["cycle"]["V9"]["lpips"]
+
     write_config(tmp_path, updates=STOP_AT + 1)
     changed = states(tmp_path, capsys)
     assert {name for name, state in changed.items() if state != "done"} == {
         "train-V9",
         "quality-V9",
     }
+
+
+def test_kept_weights_that_lack_a_system_are_refused(tmp_path, capsys):
+    write_config(tmp_path, updates=1)
+    assert paper(tmp_path, "--weights", str(tmp_path)) == InputError.exit_code
+    assert "no V9.safetensors" in capsys.readouterr().err
+    both = ("--weights", str(tmp_path), "--keep-weights", str(tmp_path))
+    assert paper(tmp_path, *both) == InputError.exit_code
 
 
 @pytest.mark.parametrize("name", ["small", "published"])
