@@ -19,8 +19,8 @@ import numpy as np
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.files.limits import LATERAL_OFFSET_M
-from alpasim_plugin.core.geometry import densify, project, rigid, shifted
-from alpasim_plugin.core.types import F64, Lane, LaneMap, LaneMarkType
+from alpasim_plugin.core.geometry import densify, direction_of, project, rigid, shifted
+from alpasim_plugin.core.types import F64, I64, Lane, LaneMap, LaneMarkType
 from scenarios.junction_marks import Side, with_open_junctions
 from scenarios.map_lines import bordered
 from scenarios.map_route import Spot
@@ -33,6 +33,7 @@ from scenarios.opendrive_road import (
     Road,
     RoadMark,
     Section,
+    beside,
     cubics_at,
     driven_along,
     gap_m,
@@ -59,6 +60,8 @@ MAX_TURN_RAD = (
 STRAIGHT_STEP_M = 2.0
 MAX_OFFSET_M = LATERAL_OFFSET_M.high
 MAX_MISSING_M = 1.0  # by which a reference line may be shorter than its road; it is extended
+BACK_M = 1e-3  # by which an edge may run back
+FORWARDS = 0.5  # cosine between the road and a step of an edge, where others run back
 MIN_WIDTH_M = 0.1  # lanes that never reach this width are ignored
 KINDS = {
     **dict.fromkeys(
@@ -453,11 +456,39 @@ def _section(
         if float(np.abs(outer_t - inner_t).max()) < MIN_WIDTH_M:
             left_out[f"{lane.kind}, nowhere {MIN_WIDTH_M} m wide"] += 1
             continue
-        borders = [road_points(road, line, s, t, T_local_map) for t in (inner_t, outer_t)]
+        kept = _advancing(line, [beside(line, t) for t in (inner_t, outer_t)])
+        borders = [road_points(road, line, s, t, T_local_map)[kept] for t in (inner_t, outer_t)]
         lanes.append(_lane(road, index, section, lane, borders))
         if len(set(limits_in(lane, road, section))) > 1:
             changing.append(lane_key(road, index, lane.lane_id))
     return lanes
+
+
+def _advancing(line: F64, edges: Sequence[F64]) -> I64:
+    """Return the stations of a lane without those at which an edge runs back, as inside of corners
+    of a reference line that is made of straight pieces. Its ends stay.
+
+    Args:
+        line: ``(N, 3)`` reference line with headings.
+        edges: Its edges, each ``(N, 2)``, in the same coordinates.
+    """
+    direction = direction_of(line[:, 2])
+    stations = np.arange(len(line))
+    along = [np.sum(np.diff(edge, axis=0) * direction[1:], axis=1) for edge in edges]
+    if all((step_m >= -BACK_M).all() for step_m in along):
+        return stations
+
+    def leads_on(begin: int, end: int) -> bool:
+        steps = [edge[end] - edge[begin] for edge in edges]
+        return all(step @ direction[end] >= FORWARDS * np.hypot(*step) for step in steps)
+
+    kept = [0]
+    for station in stations[1:-1].tolist():
+        if leads_on(kept[-1], station):
+            kept.append(station)
+    while len(kept) > 1 and not leads_on(kept[-1], len(line) - 1):
+        kept.pop()
+    return np.array([*kept, len(line) - 1], dtype=np.int64)
 
 
 def _lane(road: Road, index: int, section: Section, lane: OdrLane, borders: Sequence[F64]) -> Lane:

@@ -415,3 +415,29 @@ def test_paint_of_marks():
     sides = f"{middle}<right>{lane(-1, more=mark.format('broken', 'white'))}</right>"
     one = lanes_of(road(sections=f'<laneSection s="0">{sides}</laneSection>')).lanes["1.0.-1"]
     assert (one.left_mark_type, one.right_mark_type) == ("double_yellow", "dashed_white")
+
+
+def test_a_lane_inside_of_corners_runs_forwards():
+    """The reference line turns by 10 degrees every 2 m, 11 m to the left of the lane's middle."""
+    places = [np.zeros(2)]
+    headings = -np.radians(10.0) * np.arange(9)
+    for yaw in headings:
+        places.append(places[-1] + 2.0 * np.array([np.cos(yaw), np.sin(yaw)]))
+    view = "".join(
+        f'<geometry s="{2 * n}" x="{x}" y="{y}" hdg="{yaw}" length="2"><line/></geometry>'
+        for n, ((x, y), yaw) in enumerate(zip(places, headings, strict=False))
+    )
+    sides = lane(-1, '<width sOffset="0" a="7" b="0" c="0" d="0"/>') + lane(-2)
+    flat = "".join(f'<elevation s="{s}" a="0" b="0" c="0" d="0"/>' for s in (0, 9))
+    heights = f"<elevationProfile>{flat}</elevationProfile>"  # two records: stations every 0.5 m
+    lanes = lanes_of(road(right=sides, view=view, length=18, before=heights)).lanes
+    for key in ("1.0.-1", "1.0.-2"):
+        centre = lanes[key].centre
+        steps = np.diff(centre[:, :2], axis=0)
+        yaw = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0])[np.hypot(*steps.T) > 1e-6])
+        assert yaw.min() > headings[-1] - 0.4
+        assert yaw.max() < 0.4
+        assert len(lanes[key].left) == len(lanes[key].right)
+    ends = lanes["1.0.-2"].centre[[0, -1], :2]
+    left = np.array([-np.sin(headings[-1]), np.cos(headings[-1])])
+    assert ends == pytest.approx(np.stack([[0.0, -8.75], places[-1] - 8.75 * left]), abs=1e-6)
