@@ -1,5 +1,5 @@
-"""Lane keeping: off the road, in a wrong lane, and the gap to the border of the lanes around the
-ego.
+"""Lane keeping: off the road, in a wrong lane or in none for cars, and the gap to the border of the
+lanes around the ego.
 
 Protocol (paper, appendix "Off-road"). Nearby lanes are those whose centre line passes within 6 m of
 the ego's box centre, in 3-D and whatever their direction. A step is on the road if one nearby
@@ -46,11 +46,11 @@ class Containment:
     )
 
 
-def containment(road: Road, ego: Footprints, xyz: F64) -> Containment:
-    """Test footprints ``(T,)`` with box centres ``(T, 3)`` against single lanes and against the
-    union of nearby lanes.
+def containment(road: Road, ego: Footprints, xyz: F64, below_m: float) -> Containment:
+    """Test footprints ``(T,)`` with box centres ``(T, 3)``, so far above the ground, against single
+    lanes and against the union of nearby lanes.
     """
-    near = road.lanes_near(xyz)
+    near = road.lanes_near(xyz, below_m)
     shapes = ego.shapes()
     step, lane = np.nonzero(near)
     areas = road.areas(lane)
@@ -90,6 +90,20 @@ def wrong_lane(road: Road, near: Bool, xy: F64, yaw: F64, preset: Preset) -> Boo
     return out if preset.wrong_lane_rule == "any_opposes" else out & ~agreed
 
 
+def in_no_car_lane(road: Road, near: Bool, xy: F64) -> Bool:
+    """Return whether the nearby lanes that contain the ego's centre ``(T, 2)`` are shoulders, parking
+    strips, bicycle or bus lanes alone. Where no lane contains it, it is in none of these.
+    """
+    step, lane = np.nonzero(near)
+    inside = shapely.contains(road.areas(lane), shapely.points(xy[step]))
+    step = step[inside]
+    is_for_cars = road.is_for_cars[lane[inside]]
+    out = np.zeros(len(xy), dtype=np.bool_)
+    out[step[~is_for_cars]] = True
+    out[step[is_for_cars]] = False
+    return out
+
+
 def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[MetricSeries]:
     """Give ``offroad``, ``wrong_lane`` and ``min_distance_to_lane_boundary_m`` per step; a missing
     map is invalid, never zero.
@@ -111,18 +125,21 @@ def evaluate_offroad(rollout: RolloutLog, scene: Scene, preset: Preset) -> list[
     road = road_of(lane_map, origin, preset)
     ego = ego_footprints(rollout, preset, origin)
     xyz = rollout.ego.xyz - origin
+    below_m = rollout.ego_box.height_m / 2
     if preset.offroad_rule == "margin":
         if preset.missing_road == "error" and road.surface.is_empty:
             raise _no_map(rollout, preset, "no lane of the map has an area")
-        margin_m = road.surface.margin_m(ego.shapes(), xyz)
-        against = wrong_lane(road, road.lanes_near(xyz), ego.centres(), ego.yaw, preset)
+        margin_m = road.surface.margin_m(ego.shapes(), xyz - np.array([0.0, 0.0, below_m]))
+        near = road.lanes_near(xyz, below_m)
+        against = wrong_lane(road, near, ego.centres(), ego.yaw, preset)
         return [
             series("offroad", t_us, margin_m < -MARGIN_M),
             series("offroad_margin_m", t_us, margin_m, np.isfinite(margin_m), NO_SURFACE),
             series("wrong_lane", t_us, against),
+            series("no_car_lane_share", t_us, in_no_car_lane(road, near, ego.centres())),
             series("min_distance_to_lane_boundary_m", t_us, np.maximum(margin_m, 0.0)),
         ]
-    held = containment(road, ego, xyz)
+    held = containment(road, ego, xyz, below_m)
     off = np.zeros(len(t_us), dtype=np.bool_)
     is_decided = held.in_one | held.in_union
     undecided = np.flatnonzero(~is_decided)

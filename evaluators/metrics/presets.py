@@ -44,6 +44,9 @@ class Preset:
     # only its stored vertices.
     lane_radius_m: float = 6.0
     lane_query: Literal["line", "vertices"] = "line"
+    # A lane or an area farther above or below the ground under the ego is another road. None: the
+    # radius alone decides.
+    lane_height_m: float | None = 2.0
     lane_half_width_m: float = 1.85  # buffer of the centre where an edge is missing
     seam_m: float = 1e-6  # gaps between lanes up to this wide are closed; 1 um is rounding
     # Off the road. "edge_touch": no nearby lane holds the footprint and it touches a road edge.
@@ -57,9 +60,7 @@ class Preset:
     # in 3-D. "nearest_of_level": the same of the edges whose vertex beside the ego is at its
     # height.
     edge_query: Literal["any", "nearest_vertex", "nearest_of_level"] = "any"
-    edge_height_m: float = (
-        3.0  # edges and surfaces farther above or below the box centre belong to another road
-    )
+    edge_height_m: float = 3.0  # edges farther above or below the box centre belong to another road
     alpasim_map: bool = (
         False  # read the road as AlpaSim's own loader does, where the scene says that this differs
     )
@@ -133,6 +134,7 @@ ALPASIM = Preset(
     shrink=0.02,
     roundness=0.5,
     levels=False,
+    lane_height_m=None,
     hits="last",
     lane_query="vertices",
     seam_m=0.0,
@@ -166,7 +168,9 @@ ALPASIM_LATER = replace(
 )
 
 PRESETS: dict[str, Preset] = {
-    "paper": Preset(name="paper", ego_size_m=(4.855, 1.88), ends_with_recording=True),
+    "paper": Preset(
+        name="paper", ego_size_m=(4.855, 1.88), lane_height_m=None, ends_with_recording=True
+    ),
     ALPASIM.name: ALPASIM,
     ALPASIM_LATER.name: ALPASIM_LATER,
     "strict": Preset(

@@ -5,6 +5,7 @@ Areas and unions are built where a rollout comes, and kept for the next rollout.
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +18,20 @@ from alpasim_plugin.core.lane_areas import lane_polygon, ring_area
 from alpasim_plugin.core.types import F64, I64, Bool, LaneMap
 from evaluators.metrics.footprint import Geometries
 from evaluators.metrics.presets import Preset
-from evaluators.metrics.surface import Region, Surface, segment_distance
+from evaluators.metrics.surface import SLOPE, Region, Surface, segment_distance
 
 LEVEL_RADIUS_M = 30.0  # AlpaSim's later rule looks no further for road edges
+
+
+@dataclass(frozen=True)
+class Level:
+    """What is on the level of a vehicle: no farther above or below the ground under it than
+    ``height_m``, and `evaluators.metrics.surface.SLOPE` for each metre of distance. The ground is
+    ``below_m`` below the middle of its box.
+    """
+
+    height_m: float
+    below_m: float
 
 
 class Polylines:
@@ -44,15 +56,31 @@ class Polylines:
     def _tree(self) -> shapely.STRtree:
         return shapely.STRtree(self._segments)
 
-    def line_within(self, xyz: F64, radius_m: float) -> Bool:
-        """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D."""
+    def line_within(self, xyz: F64, radius_m: float, level: Level | None = None) -> Bool:
+        """Return which lines ``(T, L)`` come within a radius of points ``(T, 3)``, in 3-D; with a
+        level only by their parts on it.
+        """
         out = np.zeros((len(xyz), self.n_lines), dtype=np.bool_)
         point, segment = self._tree.query(
             shapely.points(xyz[:, :2]), predicate="dwithin", distance=radius_m + 1e-6
         )
         near = segment_distance(self.start[segment], self.end[segment], xyz[point]) <= radius_m
+        if level is not None:
+            near &= self._on_level(segment, xyz[point], level)
         out[point[near], self.owner[segment[near]]] = True
         return out
+
+    def _on_level(self, segment: I64, xyz: F64, level: Level) -> Bool:
+        """Return which segments ``(M,)`` are on the level of points ``(M, 3)`` where they are nearest
+        in plan view.
+        """
+        along = self.end[segment] - self.start[segment]
+        offset = xyz - self.start[segment]
+        length2 = np.maximum(np.sum(along[:, :2] ** 2, axis=1), 1e-12)
+        share = np.clip(np.sum(along[:, :2] * offset[:, :2], axis=1) / length2, 0.0, 1.0)
+        rise_m = np.abs(share * along[:, 2] - offset[:, 2] + level.below_m)
+        away_m = np.hypot(*(share[:, None] * along[:, :2] - offset[:, :2]).T)
+        return rise_m <= level.height_m + SLOPE * away_m
 
     def vertex_within(self, xyz: F64, radius_m: float) -> Bool:
         """Return which lines ``(T, L)`` own a vertex within a radius of points ``(T, 3)``, in
@@ -140,6 +168,11 @@ class Road:
         return self._areas[lane]
 
     @cached_property
+    def is_for_cars(self) -> Bool:
+        """Which lanes ``(L,)`` are for cars: no shoulder, parking strip, bicycle or bus lane."""
+        return np.array([lane.kind == "vehicle" for lane in self._lanes], dtype=np.bool_)
+
+    @cached_property
     def edges(self) -> Geometries:
         """Road edges in plan view, ``(E,)``."""
         return _lines(self._edges, self.origin)
@@ -160,15 +193,18 @@ class Road:
         rings = [ring_area(ring) for ring in outer]
         areas = np.array([*self.areas(np.arange(len(self._lanes))), *rings], dtype=object)
         outlines = [*(lane.centre - self.origin for lane in self._lanes), *outer]
-        return Surface(areas, outlines, self._preset.seam_m, self._preset.edge_height_m)
+        level_m = self._preset.lane_height_m or self._preset.edge_height_m
+        return Surface(areas, outlines, self._preset.seam_m, level_m)
 
-    def lanes_near(self, xyz: F64) -> Bool:
-        """Return which lanes ``(T, L)`` pass near points ``(T, 3)``, by the preset's radius and
-        query, in 3-D whatever their direction.
+    def lanes_near(self, xyz: F64, below_m: float) -> Bool:
+        """Return which lanes ``(T, L)`` pass near box centres ``(T, 3)``, by the preset's radius and
+        query, in 3-D whatever their direction; the ground is so far below the centres.
         """
         if self._preset.lane_query == "vertices":
             return self._centre.vertex_within(xyz, self._preset.lane_radius_m)
-        return self._centre.line_within(xyz, self._preset.lane_radius_m)
+        height_m = self._preset.lane_height_m
+        level = None if height_m is None else Level(height_m, below_m)
+        return self._centre.line_within(xyz, self._preset.lane_radius_m, level)
 
     def union(self, lanes: Bool) -> Any:
         """Return the prepared union of the lanes marked in ``(L,)``; kept, as unions are costly and

@@ -37,6 +37,7 @@ class ScoredRollout:
         self._lanes_by_id = scene.lane_map.lanes
         self._lanes = list(scene.lane_map.lanes.values())
         self._xyz = centre.xyz - origin
+        self._below_m = rollout.ego_box.height_m / 2
         self._road = road_of(scene.lane_map, origin, preset) if self._lanes else None
         self._signals = scene.lane_map.signals
         self._origin = origin
@@ -60,7 +61,7 @@ class ScoredRollout:
     @cached_property
     def _in_lanes(self) -> tuple[I64, I64]:
         """Pairs of step and lane whose area holds the centre of the box."""
-        step, lane = np.nonzero(self.road.lanes_near(self._xyz))
+        step, lane = np.nonzero(self.road.lanes_near(self._xyz, self._below_m))
         inside = shapely.contains_xy(self.road.areas(lane), *self.ego.centre[step].T)
         return step[inside], lane[inside]
 
@@ -77,7 +78,7 @@ class ScoredRollout:
         out = np.ones(len(self._xyz), dtype=np.bool_)
         out[step[shapely.covers(self.road.areas(lane), boxes[step])]] = False
         across = np.flatnonzero(out)
-        row, lane = np.nonzero(self.road.lanes_near(self._xyz[across]))
+        row, lane = np.nonzero(self.road.lanes_near(self._xyz[across], self._below_m))
         touches = shapely.intersects(self.road.areas(lane), boxes[across[row]])
         row = row[touches]
         lane = lane[touches]
@@ -111,7 +112,9 @@ class ScoredRollout:
         """Return whether no part of the ego is ever farther than this off the drivable surface."""
         if not self.has_map:
             return NO_MAP
-        return float(self.road.surface.margin_m(self.boxes.shapes(), self._xyz).min() >= -beyond_m)
+        ground = self._xyz - np.array([0.0, 0.0, self._below_m])
+        margin_m = self.road.surface.margin_m(self.boxes.shapes(), ground)
+        return float(margin_m.min() >= -beyond_m)
 
     @cached_property
     def against_m(self) -> F64:

@@ -10,6 +10,7 @@ the surface. It is continuous and defined however far from the map the ego is.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -17,11 +18,13 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths
+from alpasim_plugin.core.lane_areas import touching_pairs
 from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.metrics.footprint import Geometries
 
 MARGIN_M = 1e-6  # accuracy of the margin
 SLOPE = 0.2  # a road on the ego's level may lie this much higher or lower per metre of distance
+TIE_M = 0.5  # of two areas above one another, both count where their heights differ so little
 _GRID_M = 1e-7  # shared edges that differ by rounding only are joined on this grid
 # a gap is open along less than this share of its outline; what closing adds to bends of the outer
 # border is open to more
@@ -41,8 +44,8 @@ class Surface:
             areas: ``(B,)`` plan-view polygons.
             outlines: B polylines ``(N, 3)`` that give their heights.
             seam_m: Widest gap to close.
-            level_m: What lies farther above or below than this, and `SLOPE` per metre of distance,
-                is another road.
+            level_m: What lies farther above or below the ground under the ego than this, and `SLOPE`
+                per metre of distance, is another road.
         """
         self._areas, self._seam_m, self._level_m = areas, seam_m, level_m
         self._outlines = [
@@ -64,8 +67,8 @@ class Surface:
         return bool(np.all(shapely.is_empty(self._areas)))
 
     def margin_m(self, footprints: Geometries, xyz: F64) -> F64:
-        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with box centres ``(T, 3)``,
-        -inf where nothing is on their level.
+        """Return the signed margins ``(T,)`` of footprints ``(T,)`` with the ground under their
+        middles ``(T, 3)``, -inf where nothing is on their level.
         """
         level = self.on_level(xyz)
         out = np.full(len(footprints), -np.inf)
@@ -102,7 +105,37 @@ class Surface:
             out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(
                 flat, points
             )
+        return self._without_stacked(out, xyz)
+
+    @cached_property
+    def _stacked(self) -> I64:
+        """Pairs ``(P, 2)`` of areas that lie above one another."""
+        no_pairs = np.zeros((0, 2), dtype=np.int64)
+        if not len(self._bounds) or np.ptp(self._bounds[:, :, 2]) <= self._level_m:
+            return no_pairs
+        pairs, apart_m = touching_pairs(self._areas, self._outlines, self._seam_m / 2)
+        return pairs[apart_m > self._level_m]
+
+    def _without_stacked(self, level: Bool, xyz: F64) -> Bool:
+        """Return ``level (T, B)`` with, of two areas above one another, only the one that is nearer
+        in height to a point; both where these differ by less than `TIE_M`, as at the foot of a ramp.
+        """
+        out = level.copy()
+        for pair in self._stacked.tolist():
+            rows = np.flatnonzero(level[:, pair].all(axis=1))
+            if not len(rows):
+                continue
+            first_m, second_m = (self._rise_m(number, xyz[rows]) for number in pair)
+            out[rows, pair[0]] &= first_m <= second_m + TIE_M
+            out[rows, pair[1]] &= second_m <= first_m + TIE_M
         return out
+
+    def _rise_m(self, area: int, xyz: F64) -> F64:
+        """Return how far ``(T,)`` an area is above or below points ``(T, 3)`` where it is nearest."""
+        line = self._outlines[area]
+        flat = shapely.linestrings(line[:, :2])
+        along = shapely.line_locate_point(flat, shapely.points(xyz[:, :2]))
+        return np.abs(np.interp(along, arc_lengths(line), line[:, 2]) - xyz[:, 2])
 
     def region(self, chosen: Bool) -> Region:
         """Return the joined areas marked in ``(B,)``; kept, as neighbouring steps share them."""

@@ -325,6 +325,18 @@ METRICS = MetricTable(
             invalid=_NO_LANES,
             formula="all nearby lanes that contain `c` run against the ego by more than 120 degrees, and there is one",
         ),
+        "no_car_lane_share": MetricInfo(
+            "",
+            "lower",
+            "mean",
+            "share of the steps at which only shoulders, parking strips, bicycle or bus lanes are under the ego's centre",
+            is_share=True,
+            label="steps in no lane for cars",
+            margin=0.02,
+            reference=CENTRE,
+            invalid=_NO_LANES,
+            formula="1 where lanes on the ego's level contain `c` and none of them is for cars; `strict` only",
+        ),
         "min_distance_to_lane_boundary_m": _metres(
             "gap to the border of the joined nearby lanes; 0 when not inside",
             "higher",

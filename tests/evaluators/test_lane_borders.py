@@ -24,7 +24,9 @@ def checked(lane_map, log):
     where = scene(lane_map, log)
     origin = origin_of(where.ego_log, PAPER)
     road = Road(lane_map, origin, PAPER)
-    held = containment(road, ego_footprints(log, PAPER, origin), log.ego.xyz - origin)
+    centres = log.ego.xyz - origin
+    below_m = log.ego_box.height_m / 2
+    held = containment(road, ego_footprints(log, PAPER, origin), centres, below_m)
     slow = road_by_step(log, where, PAPER)
     assert (held.in_one | held.in_union).tolist() == [one.on_road for one in slow]
     np.testing.assert_allclose(

@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.types import Box
+from alpasim_plugin.core.types import Box, Lane
 from evaluators import PRESETS
 from evaluators.metrics.collision import contact_events
-from tests.evaluators.eval_build import CAR, car, rollout, scored, track
+from tests.evaluators.eval_build import (
+    CAR,
+    VEHICLE,
+    car,
+    lane,
+    road_map,
+    rollout,
+    scored,
+    track,
+)
 from tests.evaluators.motions import CRUISE, N
 
 TRUCK = Box(8.5, 2.5, 3.4)
@@ -89,3 +98,73 @@ def test_a_car_up_the_hill_is_ahead_and_a_ramp_leads_onto_the_ego_s_level():
     down = np.interp(np.arange(N), [0, N // 2], [7.0, 0.0])
     onto = car("merges", track(np.full(N, 40.0), 0.0, z=down))
     assert touched(rollout(track(CRUISE, 0.0), [onto]))
+
+
+def stacked_map(above_m):
+    """A road along x, and a wider one above it, driven the other way, with a limit of its own."""
+    below = lane("below", 0.0, speed_limit_mps=20.0)
+    centre = np.array([[200.0, 2.0, above_m], [-50.0, 2.0, above_m]])
+    side = np.array([0.0, 6.0, 0.0])
+    above = Lane("above", centre, centre - side, centre + side, speed_limit_mps=5.0)
+    edges = [np.array([[-50.0, y, 0.0], [200.0, y, 0.0]]) for y in (-1.75, 1.75)]
+    return road_map(below, above, edges=edges)
+
+
+@pytest.mark.parametrize("above_m", [7.0, 4.0, 3.0])  # 3 m: decks of a car park
+def test_the_road_above_is_neither_the_surface_nor_a_lane_of_the_ego(above_m):
+    log = rollout(track(CRUISE, 1.5, z=VEHICLE.box.height_m / 2))
+    alone = scored(log, road_map(stacked_map(above_m).lanes["below"]))
+    under = scored(log, stacked_map(above_m))
+    assert alone["offroad"].value.all()
+    for name in ("offroad", "offroad_margin_m", "wrong_lane", "min_distance_to_lane_boundary_m"):
+        assert np.array_equal(under[name].value, alone[name].value), name
+
+
+@pytest.mark.parametrize("above_m", [7.0, 4.0, 3.0])
+def test_on_the_upper_road_its_own_border_counts(above_m):
+    yaw = np.full(N, np.pi)
+    poses = track(150.0 - CRUISE, 6.0, yaw=yaw, z=above_m + VEHICLE.box.height_m / 2)
+    values = scored(rollout(poses), stacked_map(above_m))
+    half_m = VEHICLE.box.width_m / 2
+    assert values["offroad_margin_m"].value == pytest.approx(np.full(N, 2.0 - half_m), abs=1e-6)
+    assert not values["wrong_lane"].value.any()
+
+
+@pytest.mark.parametrize("name", ["nuplan", "navsim"])
+@pytest.mark.parametrize("above_m", [7.0, 4.0, 3.0])
+def test_no_benchmark_takes_the_road_above_for_that_of_the_ego(name, above_m):
+    both = stacked_map(above_m)
+    below = road_map(both.lanes["below"], edges=both.road_edges)
+    for y in (0.0, 3.0):
+        log = rollout(track(CRUISE, y, z=VEHICLE.box.height_m / 2))
+        alone = scored(log, below, preset=name)
+        under = scored(log, both, preset=name)
+        for key, series in alone.items():
+            assert np.array_equal(under[key].value, series.value, equal_nan=True), key
+
+
+def test_a_ramp_is_one_surface_with_the_road_at_its_foot_and_not_above_it():
+    x = np.linspace(-50.0, 200.0, 251)
+    height = 6.0 * np.clip((x - 20.0) / 60.0, 0.0, 1.0)
+    lines = [np.column_stack([x, 0 * x + y, height]) for y in (3.5, 5.25, 1.75)]
+    lanes = road_map(lane("road", 0.0), Lane("ramp", *lines))
+
+    def margins(y, z):
+        log = rollout(track(CRUISE, y, z=z + VEHICLE.box.height_m / 2))
+        return scored(log, lanes)["offroad_margin_m"].value
+
+    half_m = VEHICLE.box.width_m / 2
+    between = margins(1.75, 0.0)
+    assert between[CRUISE < 20.0] == pytest.approx(3.5 - half_m, abs=1e-6)
+    assert between[CRUISE > 60.0] == pytest.approx(-half_m, abs=1e-6)
+    on_ramp = margins(3.5, np.interp(CRUISE, x, height))
+    assert on_ramp[CRUISE > 60.0] == pytest.approx(1.75 - half_m, abs=1e-6)
+
+
+def test_presets_that_look_from_above_take_the_road_above_for_the_ego_s_own():
+    log = rollout(track(CRUISE, 3.0, z=VEHICLE.box.height_m / 2))
+    for preset in ("paper", *FLAT):
+        assert PRESETS[preset].lane_height_m is None
+        assert not scored(log, stacked_map(3.0), preset)["offroad"].value.any()
+    for preset in ("strict", "nuplan", "navsim"):
+        assert PRESETS[preset].lane_height_m == 2.0

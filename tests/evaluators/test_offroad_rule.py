@@ -43,7 +43,9 @@ def held(log, lane_map, preset=PAPER):
     where = scene(lane_map, log)
     origin = origin_of(where.ego_log, PAPER)
     road = road_of(lane_map, origin, preset)
-    return containment(road, ego_footprints(log, preset, origin), log.ego.xyz - origin)
+    centres = log.ego.xyz - origin
+    below_m = log.ego_box.height_m / 2
+    return containment(road, ego_footprints(log, preset, origin), centres, below_m)
 
 
 def edge_line(y, x0=-50.0, z=0.0):
