@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from alpasim_plugin.cameras.shutter import Along
+from alpasim_plugin.cameras.shutter import Along, Band, bands, largest_motion_px
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.geometry import unit
 from alpasim_plugin.core.types import (
     F32,
     F64,
@@ -524,6 +525,17 @@ def lens_shares(camera: CameraSpec, pinhole: Lens, along: Along, backwards: bool
     share = np.clip(position / max(count - 1, 1), 0, 1) if count > 1 else np.ones_like(position)
     near = cv2.dilate(is_visible.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
     return np.where(near, 1 - share if backwards else share, np.float32(np.nan)).astype(np.float32)
+
+
+def exposed_bands(request: RenderRequest) -> list[Band]:
+    """Return the bands of a request's frame as `shutter.bands`, through its camera's lens."""
+    camera = request.camera
+    if camera.lens is None or request.exposure is None:
+        return bands(request)
+    u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
+    rays = rays_at(camera, np.column_stack([u.ravel(), v.ravel()]))
+    sight = unit(rays.ray[rays.visible])
+    return bands(request, largest_motion_px(request, sight, max(rays.focal)))
 
 
 def resized(camera: CameraSpec, width: int, height: int) -> CameraSpec:

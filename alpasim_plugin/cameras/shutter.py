@@ -88,9 +88,14 @@ def rolling_exposure(
     return Exposure(rolling(camera.width, camera.height, "rows", backwards=False), start)
 
 
-def bands(request: RenderRequest) -> list[Band]:
+def bands(request: RenderRequest, moves_px: float | None = None) -> list[Band]:
     """Return the bands of a request's frame, in the order of their time; without an exposure one,
     at the shutter's end.
+
+    Args:
+        request: The frame.
+        moves_px: By how much a thing in the image moves while the shutter is open, at most; None:
+            that of the pinhole ``K``.
     """
     height = request.camera.height
     width = request.camera.width
@@ -98,7 +103,8 @@ def bands(request: RenderRequest) -> list[Band]:
         return [
             Band(slice(0, height), slice(0, width), None, request.T_world_camera[1], request.actors)
         ]
-    count = min(max(int(np.ceil(motion_px(request) / APART_PX)), 1), MOST_BANDS)
+    moves_px = motion_px(request) if moves_px is None else moves_px
+    count = min(max(int(np.ceil(moves_px / APART_PX)), 1), MOST_BANDS)
     return list(bands_of(request, count))
 
 

@@ -1,5 +1,5 @@
-"""What a fixer gets with the frame of a lens: references and maps are made in the pinholes that cover
-it. Where a renderer draws pinholes alone, so is the frame.
+"""What a fixer gets with the frame of a lens: references are made in the pinholes that cover it. Where
+a renderer draws pinholes alone, so is the frame, and on a device the semantic map.
 """
 
 from collections.abc import Sequence

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.cameras.lens import blackened, joined_references
+from alpasim_plugin.cameras.lens import Lens, blackened, joined_references
 from alpasim_plugin.cameras.lens_cover import LensCover
+from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import FixerError, FixerFault, InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
@@ -65,8 +66,8 @@ class BlockRunner:
         on_device: Whether the fixer takes the references and the map of a frame that a device drew
             from there.
         cover: The pinholes that are rendered of lenses; the fixer sees the lens's image.
-        draws_lenses: Whether the base renderer draws lenses itself; references and maps are made in
-            the pinholes all the same.
+        draws_lenses: Whether the base renderer draws lenses itself; references are made in the
+            pinholes all the same.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -86,40 +87,64 @@ class BlockRunner:
 
     def render(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
         """Render the frames of an instant, warp their references and draw their maps."""
-        cuts = [self.cover.requests(request) for request in requests]
         if not self.cover.sides:
-            return self._conditioned(requests, self.render_base(requests))
-        if self.draws_lenses:
-            return self._through_lenses(requests, cuts)
-        pinholes = [part for cut in cuts for part in cut]
-        parts = self._conditioned(pinholes, self.render_base(pinholes))
-        remaining = iter(parts)
-        request_parts = [
-            (request, [next(remaining) for _ in cut])
-            for request, cut in zip(requests, cuts, strict=True)
-        ]
-        threads = 1 if parts[0].frame.pending else thread_count(self.threads)
-        with self._timed("lens"):
-            return map_on_threads(threads, self._joined, request_parts)
+            frames = self._with_references(requests, self.render_base(requests))
+            maps = self._maps(requests, self._map_device(frames))
+            return list(map(ConditionedFrame, requests, frames, maps))
+        cuts = [self.cover.requests(request) for request in requests]
+        if not self.draws_lenses:
+            return self._covered(requests, cuts)
+        frames = self._lens_frames(requests, cuts)
+        return list(map(ConditionedFrame, requests, frames, self._maps(requests, "cpu")))
 
-    def _joined(
-        self, request_parts: tuple[RenderRequest, Sequence[ConditionedFrame]]
-    ) -> ConditionedFrame:
-        request, parts = request_parts
-        if request.camera.lens is None:
-            return parts[0]
-        sides = self.cover.sides[request.camera.name]
-        frame = joined(request.camera.name, sides, [part.frame for part in parts])
-        image = None
-        if self.scene_map is not None:
-            image = joined_image(sides, [part.map for part in parts])
-        return ConditionedFrame(request, frame, image)
-
-    def _through_lenses(
+    def _covered(
         self, requests: Sequence[RenderRequest], cuts: Sequence[Sequence[RenderRequest]]
     ) -> list[ConditionedFrame]:
-        """Render frames through lenses, with what is warped and drawn into the pinholes of each."""
+        """Render the pinholes of each lens and join their frames. The map is drawn through the lens;
+        for a device, into the pinholes.
+        """
+        pinholes = [part for cut in cuts for part in cut]
+        parts = self._with_references(pinholes, self.render_base(pinholes))
+        device = self._map_device(parts)
+        frames = self._joined(requests, cuts, parts, joined)
+        if implementation(device, True, False):
+            maps = self._maps(requests, "cpu")
+        else:
+            maps = self._joined(requests, cuts, self._maps(pinholes, device), _joined_map)
+        return list(map(ConditionedFrame, requests, frames, maps))
+
+    def _joined(
+        self,
+        requests: Sequence[RenderRequest],
+        cuts: Sequence[Sequence[RenderRequest]],
+        parts: Sequence[Any],
+        join: Callable[[str, Sequence[Lens], Sequence[Any]], Any],
+    ) -> list[Any]:
+        """Return what pinholes have, joined to that of the lens of each request."""
+        remaining = iter(parts)
+        lens_parts = [
+            (request.camera.name, [next(remaining) for _ in cut])
+            for request, cut in zip(requests, cuts, strict=True)
+        ]
+        is_pending = isinstance(parts[0], Frame) and parts[0].pending is not None
+
+        def join_one(camera_parts: tuple[str, Sequence[Any]]) -> Any:
+            name, images = camera_parts
+            sides = self.cover.sides.get(name)
+            return images[0] if sides is None else join(name, sides, images)
+
+        with self._timed("lens"):
+            return map_on_threads(
+                1 if is_pending else thread_count(self.threads), join_one, lens_parts
+            )
+
+    def _lens_frames(
+        self, requests: Sequence[RenderRequest], cuts: Sequence[Sequence[RenderRequest]]
+    ) -> list[Frame]:
+        """Render frames through lenses; references are warped into the pinholes of each."""
         frames = self.render_base(requests)
+        if self.references is None:
+            return list(frames)
         lenses = [self.cover.sides.get(request.camera.name) for request in requests]
         with self._timed("lens"):
             depths = [
@@ -127,36 +152,37 @@ class BlockRunner:
                 for frame, sides, cut in zip(frames, lenses, cuts, strict=True)
             ]
         pinholes = [part for cut in cuts for part in cut]
-        parts = iter(self._conditioned(pinholes, [part for cut in depths for part in cut]))
+        parts = iter(self._with_references(pinholes, [part for cut in depths for part in cut]))
         out = []
-        for request, frame, sides, cut in zip(requests, frames, lenses, cuts, strict=True):
+        for frame, sides, cut in zip(frames, lenses, cuts, strict=True):
             lens_parts = [next(parts) for _ in cut]
             if sides is None:
                 out.append(lens_parts[0])
                 continue
             with self._timed("lens"):
-                references = joined_references(sides, [part.frame for part in lens_parts])
-                image = None
-                if self.scene_map is not None:
-                    image = joined_image(sides, [part.map for part in lens_parts])
-            out.append(ConditionedFrame(request, frame.changed(references=references), image))
+                references = joined_references(sides, lens_parts)
+            out.append(frame.changed(references=references))
         return out
 
-    def _conditioned(
+    def _with_references(
         self, requests: Sequence[RenderRequest], frames: Sequence[Frame]
-    ) -> list[ConditionedFrame]:
-        """Return frames with their references and maps."""
-        if self.references is not None:
-            with self._timed("references"):
-                frames = self.references.added(requests, frames, self.on_device)
-        images: Sequence[Any] = [None] * len(frames)
-        if self.scene_map is not None:
-            device = frames[0].device if self.on_device else "cpu"
-            with self._timed("map"):
-                images = draw_exposed_maps(
-                    self.scene_map, requests, self.actors, self.threads, device
-                )
-        return list(map(ConditionedFrame, requests, frames, images))
+    ) -> Sequence[Frame]:
+        """Return frames with the recorded ones that are carried into them."""
+        if self.references is None:
+            return frames
+        with self._timed("references"):
+            return self.references.added(requests, frames, self.on_device)
+
+    def _map_device(self, frames: Sequence[Frame]) -> Any:
+        """Return what draws the maps of frames: the device that drew them, where the fixer reads it."""
+        return frames[0].device if self.on_device else "cpu"
+
+    def _maps(self, requests: Sequence[RenderRequest], device: Any) -> Sequence[Any]:
+        """Return the maps of requests, through their lenses; None where the fixer uses none."""
+        if self.scene_map is None:
+            return [None] * len(requests)
+        with self._timed("map"):
+            return draw_exposed_maps(self.scene_map, requests, self.actors, self.threads, device)
 
     def fix(self, fixer: Fixer, call: Call, block: Sequence[ConditionedFrame]) -> list[Frame]:
         """Fix a block and check the result.
@@ -196,6 +222,11 @@ class BlockRunner:
         began = time.perf_counter()
         yield
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
+
+
+def _joined_map(camera: str, sides: Sequence[Lens], images: Sequence[Any]) -> Any:
+    """Return the map of a camera's lens from those of its pinholes, which a device drew."""
+    return None if images[0] is None else joined_image(sides, images)
 
 
 def _problem(rendered: Sequence[Frame], fixed: Sequence[Frame]) -> str:

@@ -135,12 +135,12 @@ def test_the_map_has_the_shutter_of_the_frame():
     asked = ask()
     view = read_view(asked)
     entry = made.scenes.get(asked.scene_id)
-    (lens,) = sides = sides_of_request(asked)
+    (lens,) = sides_of_request(asked)
     camera = lens.spec("front", np.eye(4))
     boxes = {name: pair[1] for name, pair in view.objects.items()}
     request = RenderRequest(view.t_us, camera, view.T_world_camera, boxes, exposure=exposure(asked))
-    drawn = drawn_map(entry, [request], sides)
-    still = drawn_map(entry, [replace(request, exposure=None)], sides)
+    drawn = drawn_map(entry, request)
+    still = drawn_map(entry, replace(request, exposure=None))
     assert still is not None
     assert (drawn != still).any()
     assert entry.scene_map is not None

@@ -10,6 +10,7 @@ from alpasim_plugin.cameras.shutter import rolling_exposure
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import CameraSpec, Frame, LensModel, RenderRequest
 from alpasim_plugin.fixers.loop import BlockRunner
+from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.runs.lenses import LensRenderer
 
@@ -128,7 +129,9 @@ def test_a_fixer_over_a_renderer_of_lenses_has_maps_and_references_of_the_same_l
     )
     (joined,) = by_pinholes.render([request])
     (seen,) = through_lens.render([request])
-    np.testing.assert_array_equal(seen.map, joined.map)
+    np.testing.assert_array_equal(seen.map, draw_map(scene_map, camera, T[1]))
+    np.testing.assert_array_equal(joined.map, seen.map)
+    assert seen.map.any()
     visible = rays_of(camera).visible.reshape(150, 200)
     off = np.abs(seen.frame.rgb.astype(int) - joined.frame.rgb)[visible]
     assert np.mean(off <= 2) > 0.995

@@ -34,6 +34,7 @@ from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, camera_of, read_sides, straight_of
 from alpasim_plugin.cameras.lens import Lens, blind_of, joined_references
 from alpasim_plugin.cameras.shutter import at_share
+from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, project
@@ -182,17 +183,24 @@ def name_in_scene(entry: SceneEntry, view: View) -> str:
     return stored_camera.name if stored_camera else view.camera
 
 
-def drawn_map(
-    entry: SceneEntry, requests: Sequence[RenderRequest], sides: Sequence[Lens], device: Any = "cpu"
+def drawn_map(entry: SceneEntry, request: RenderRequest) -> U8 | None:
+    """Return the semantic map as the request's lens sees it; None where the fixer takes none."""
+    if entry.scene_map is None:
+        return None
+    (image,) = draw_exposed_maps(entry.scene_map, [request], entry.scenario.actors)
+    return np.asarray(image, dtype=np.uint8)
+
+
+def drawn_map_on_device(
+    entry: SceneEntry, requests: Sequence[RenderRequest], sides: Sequence[Lens], device: Any
 ) -> Any:
-    """Return the semantic map as the lens sees it, of the device that drew its frame; None where
+    """Return the semantic map of a lens that a device draws in the pinholes that cover it; None where
     the fixer takes none.
     """
-    scene_map = entry.scene_map
-    actors = entry.scenario.actors
-    if scene_map is None:
+    if entry.scene_map is None:
         return None
-    return joined_image(sides, draw_exposed_maps(scene_map, requests, actors, device=device))
+    actors = entry.scenario.actors
+    return joined_image(sides, draw_exposed_maps(entry.scene_map, requests, actors, device=device))
 
 
 def with_fitting_map(
@@ -312,14 +320,17 @@ class LocalSource:
         entry = self._scenes.get(view.scene_id, left)
         mount = mount_of(entry, view)
         requests = requests_of(entry, request, view, mount, pinholes)
+        through_lens = lens_request(entry, request, view, mount)
         draw = _drawn_pinholes
         if entry.draws_lenses and pinholes[0].resample is not None:
-            through_lens = lens_request(entry, request, view, mount)
             draw = partial(_drawn_lens, through_lens)
         with left.holding(self._busy):
             frame, ahead = draw(entry, requests, pinholes)
             device = frame.device if entry.reads_device else "cpu"
-            sdmap = drawn_map(entry, requests, pinholes, device)
+            if implementation(device, True, False):
+                sdmap = drawn_map(entry, through_lens)
+            else:
+                sdmap = drawn_map_on_device(entry, requests, pinholes, device)
         rendered = Rendered(frame.changed(camera=view.camera), sdmap, blind_of(pinholes))
         if sdmap is None:
             return rendered
@@ -458,10 +469,9 @@ class UpstreamSource:
         if self._scenes is not None:
             entry = self._scenes.get(view.scene_id, left)
             bare_request = Request(camera_intrinsics=without_windshield(request.camera_intrinsics))
-            sides = read_sides(bare_request.camera_intrinsics, width, height)
             sized = replace(view, width=width, height=height)
-            requests = requests_of(entry, bare_request, sized, np.eye(4), sides)
-            sdmap = drawn_map(entry, requests, sides)
+            through_lens = lens_request(entry, bare_request, sized, np.eye(4))
+            sdmap = drawn_map(entry, through_lens)
             if sdmap is not None:
                 straight = straight_of(bare_request.camera_intrinsics, width, height)
                 mounted = straight.K, mount_of(entry, view)
@@ -470,7 +480,7 @@ class UpstreamSource:
                 rendered = with_fitting_map(
                     replace(rendered, sdmap=sdmap),
                     entry,
-                    replace(requests[0], camera=camera, T_world_camera=view.T_world_camera),
+                    replace(through_lens, camera=camera),
                     straight_image,
                     view,
                 )

@@ -1,24 +1,28 @@
 """Draw the semantic map that conditions a fixer: lanes, boundaries, crossings, signs and road users
 seen from a camera.
 
-Prepare a scene once (`prepare_map`), then draw it from any pinhole camera. A depth buffer resolves
-occlusion; colours and widths fade with depth along the optical axis.
+Prepare a scene once (`prepare_map`), then draw it from any camera. A depth buffer resolves
+occlusion; colours and widths fade with depth along the optical axis, of a camera with a lens with
+that of `lens_kernels`.
 
 Camera axes are x right, y down, z forward; pixel (row i, column j) covers columns j to j + 1 and
 rows i to i + 1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.cameras.shutter import bands, joined
+from alpasim_plugin.cameras.lens import exposed_bands
+from alpasim_plugin.cameras.shutter import joined
 from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
-from alpasim_plugin.fixers.semantic_map import kernels
+from alpasim_plugin.fixers.semantic_map import kernels, lens_kernels
+from alpasim_plugin.fixers.semantic_map.lens_kernels import lens_numbers
 from alpasim_plugin.fixers.semantic_map.prepare import (
     CORNERS,
     EDGES,
@@ -39,6 +43,7 @@ from alpasim_plugin.fixers.semantic_map.style import (
     WIDTH_DEFINED_AT_PX,
     box_class,
 )
+from alpasim_plugin.gaussians.lens_camera import lens_map, lens_rays
 from alpasim_plugin.gaussians.raster.stages import run_on_threads, thread_count
 
 EDGE_STYLE = np.array((BOX_EDGE_PX, EDGE_BIAS_M, *COLOURS["box_edge"]))
@@ -57,7 +62,7 @@ def draw_map(
 
     Args:
         scene: The prepared map.
-        camera: It is drawn as the pinhole K.
+        camera: Its lens or, where it has none, its pinhole.
         T_world_camera: ``(4, 4)`` pose of the camera (x right, y down, z forward).
         actors: Road users present at this instant.
         threads: How many threads to use; None takes ``numba.get_num_threads()``. The image does not
@@ -66,14 +71,22 @@ def draw_map(
     """
     rows = slice(0, camera.height) if rows is None else rows
     view, pose, faces, edges = seen_from(scene, camera, T_world_camera, actors)
-    lines, box_edges = (strokes_of(part, pose, view) for part in (scene.segments, edges))
-    shapes = np.concatenate([shapes_of(part, pose, view) for part in (scene.triangles, faces)])
+    strokes, shapes_of_part = strokes_of, shapes_of
+    if camera.lens is not None:
+        view = lens_numbers(camera, lens_map(camera))
+        faces = replace(faces, closed=np.ones_like(faces.closed))  # nothing is cut at a near plane
+        strokes, shapes_of_part = lens_strokes_of, lens_shapes_of
+    lines, box_edges = (strokes(part, pose, view) for part in (scene.segments, edges))
+    shapes = np.concatenate([shapes_of_part(part, pose, view) for part in (scene.triangles, faces)])
     image: U8 = np.empty((rows.stop, camera.width, 3), dtype=np.uint8)
     band = np.full(1, rows.start // BAND, dtype=np.int64)
     stretch = camera.width / camera.height
     run_on_threads(
         thread_count(threads), draw_bands, band, lines, box_edges, shapes, stretch, image
     )
+    if camera.lens is not None:
+        visible = lens_rays(camera).visible.reshape(camera.height, camera.width)
+        image[rows][~visible[rows]] = 0
     return image[rows]
 
 
@@ -96,7 +109,7 @@ def draw_exposed_maps(
             once.
     """
     draw = implementation(device, partial(_on_host, threads), partial(_on_card, device))
-    cuts = [bands(request) for request in requests]
+    cuts = [exposed_bands(request) for request in requests]
     views = [
         (request.camera, band.T_world_camera, actor_boxes(band.actors, actors), band.rows)
         for request, cut in zip(requests, cuts, strict=True)
@@ -171,3 +184,26 @@ def shapes_of(part: Triangles, pose: F64, view: F64) -> F64:
     out = np.empty((2 * len(part.corners), kernels.SHAPE))
     flat = part.corners, part.closed, part.shade, part.style
     return out[: kernels.shapes(*flat, pose, view, out)]
+
+
+def lens_strokes_of(part: Segments, pose: F64, view: F64) -> F64:
+    """Return the strokes of segments ``(N, STROKE)`` in the image of a lens."""
+    put = partial(lens_kernels.lens_strokes, part.ends, part.style, pose, view)
+    return _put(put, 4 * len(part.ends), kernels.STROKE)
+
+
+def lens_shapes_of(part: Triangles, pose: F64, view: F64) -> F64:
+    """Return the shapes of triangles ``(N, SHAPE)`` in the image of a lens."""
+    flat = part.corners, part.closed, part.shade, part.style
+    put = partial(lens_kernels.lens_shapes, *flat, pose, view)
+    return _put(put, 8 * len(part.corners), kernels.SHAPE)
+
+
+def _put(put: Callable[[F64], int], expected: int, columns: int) -> F64:
+    """Return what a kernel writes, in as many rows as it needs."""
+    out = np.empty((expected, columns))
+    count = put(out)
+    if count > len(out):
+        out = np.empty((count, columns))
+        count = put(out)
+    return out[:count]

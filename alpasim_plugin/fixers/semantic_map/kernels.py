@@ -28,7 +28,7 @@ def _project(view, x, y, z):
 
 
 @kernel
-def _to_camera(pose, p):
+def to_camera(pose, p):
     """Map a point of the scene into the camera's axes by the upper ``(3, 4)`` of a transform."""
     return (
         pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3],
@@ -42,8 +42,8 @@ def strokes(ends, style, pose, view, out):
     """Project segments ``(S, 2, 3)`` into strokes; return how many can be seen."""
     count = 0
     for s in range(ends.shape[0]):
-        ax, ay, az = _to_camera(pose, ends[s, 0])
-        bx, by, bz = _to_camera(pose, ends[s, 1])
+        ax, ay, az = to_camera(pose, ends[s, 0])
+        bx, by, bz = to_camera(pose, ends[s, 1])
         if (az < NEAR_M and bz < NEAR_M) or (az >= DEPTH_MAX_M and bz >= DEPTH_MAX_M):
             continue
         dx = bx - ax
@@ -76,7 +76,7 @@ def strokes(ends, style, pose, view, out):
 
 
 @kernel
-def _faces_away(a, b, c):
+def faces_away(a, b, c):
     """Return whether the camera lies behind a triangle that is wound to the left from its front."""
     ux = b[0] - a[0]
     uy = b[1] - a[1]
@@ -123,9 +123,9 @@ def shapes(corners, closed, shade, style, pose, view, out):
     pixels = np.empty((4, 2))
     for s in range(corners.shape[0]):
         for k in range(3):
-            raw[k, 0], raw[k, 1], raw[k, 2] = _to_camera(pose, corners[s, k])
+            raw[k, 0], raw[k, 1], raw[k, 2] = to_camera(pose, corners[s, k])
             raw[k, 3] = shade[s, k]
-        if closed[s] and _faces_away(raw[0], raw[1], raw[2]):
+        if closed[s] and faces_away(raw[0], raw[1], raw[2]):
             continue
         nearest = min(raw[0, 2], raw[1, 2], raw[2, 2])
         if nearest >= DEPTH_MAX_M:
