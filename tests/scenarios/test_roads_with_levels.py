@@ -8,11 +8,13 @@ import pytest
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import Box, LaneMap
+from alpasim_plugin.world.route import LaneIndex
 from policies.road_forecast import RoadForecast, RoadUser
 from scenarios.load import load_scenario
 from scenarios.map_route import LaneGraph, Way
 from scenarios.map_traffic import place_followers
 from scenarios.map_walkers import place_walkers
+from tests.data_sets import shared_folder
 from tests.files.opendrive_text import lane, road, section
 from tests.world.stacked_roads import STACKED, lanes_of, straight
 
@@ -81,3 +83,20 @@ def test_a_vehicle_is_forecast_along_the_road_that_it_is_on(z_m, goes_straight, 
     forecast = RoadForecast(STACKED).predicted([user], 0)
     assert (abs(forecast.xy[-1, 0, 1]) < 1.0) == goes_straight
     assert forecast.z[:, 0] == pytest.approx(z_m + box.height_m / 2)
+
+
+LOGS = sorted(shared_folder().glob("av2/*/"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LOGS, reason="no logs of Argoverse 2")
+def test_recorded_drives_lie_at_the_height_of_their_lanes():
+    for folder in LOGS[:1]:
+        made = load_scenario(folder)
+        index = LaneIndex(made.lane_map)
+        places = made.ego_log.xyz[::10]
+        in_plan = index.containing_many(places[:, :2])
+        assert sum(map(len, in_plan)) > 0
+        assert index.containing_many(places) == in_plan
+        raised = places + np.array([0.0, 0.0, 4.0])
+        assert not any(index.containing_many(raised))
