@@ -131,6 +131,7 @@ ON_FOOT_M = 0.6  # half the length of a body below which it is somebody on foot
 WALK_S = 3.0  # somebody who steps into the corridor within this time is waited for ...
 CLEAR_S = 1.0  # ... unless the driver has passed so long before
 STANDS_MPS = 0.1
+TORN_M = 1.0  # an outline is no wider across a line than its diagonal, and this for curvature
 BEHIND_M = 15.0  # a body is looked for so far behind the own front bumper
 _OUTLINE = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [0.0, 1.0], [0.0, -1.0]])
 
@@ -141,8 +142,8 @@ class Spans:
 
     rear: F64  # (P,) smallest arc length of the outline
     front: F64  # (P,) largest
-    low: F64  # (P,) rightmost distance from the line
-    high: F64  # (P,) leftmost
+    low: F64  # (P,) rightmost distance from the line; infinite far from it
+    high: F64  # (P,) leftmost; infinite far from it
     speed: F64  # (P,) along the line, >= 0
     on_level: Bool  # (P,) whether the body is at the height of the line, not on a bridge or below
 
@@ -165,14 +166,19 @@ def spans(lines: Lines, line: I64, bodies: Bodies, row: I64, low: I64, high: I64
     along = along.reshape(-1, len(_OUTLINE))
     across = across.reshape(-1, len(_OUTLINE))
     rear = along.min(axis=1)
+    lowest = across.min(axis=1)
+    highest = across.max(axis=1)
+    # Two corners on both sides of a far place from which a bend is equally near in two directions.
+    is_torn = highest - lowest > 2.0 * np.hypot(*half.T) + TORN_M
+    lowest[is_torn] = highest[is_torn] = np.inf
     xyz, yaw = lines.at(line, rear)
     is_apart = np.abs(bodies.z[row] - xyz[:, 2]) > bodies.half_height_m[row] + LEVEL_M
     speed = bodies.velocity[row, 0] * np.cos(yaw) + bodies.velocity[row, 1] * np.sin(yaw)
     return Spans(
         rear,
         along.max(axis=1),
-        across.min(axis=1),
-        across.max(axis=1),
+        lowest,
+        highest,
         np.maximum(speed, 0.0),
         ~is_apart,
     )

@@ -7,8 +7,8 @@ import shapely
 from alpasim_plugin.core.geometry import quat_from_yaw, rectangle_corners, se2, yaw_of
 from alpasim_plugin.core.types import Actor, Behaviour, Box, EgoState, Trajectory, Vehicle
 from alpasim_plugin.world.actors import Actors
-from alpasim_plugin.world.idm import bodies_from, find_leader, find_leaders
-from alpasim_plugin.world.path import Lines, polyline_path
+from alpasim_plugin.world.idm import bodies_from, find_leader, find_leaders, spans
+from alpasim_plugin.world.path import Lines, polyline_path, smooth_path
 
 CAR = Box(4.6, 1.85, 1.5)
 BUS = Box(12.0, 2.5, 3.0)
@@ -155,3 +155,25 @@ def test_a_driver_does_not_wait_for_people_beside_the_road(begin_m, speed_mps):
     car = driver("car", np.arange(0.0, 150.0))
     x = driven([car, walker(begin_m, speed_mps, 30.0)], 8_000_000)["car"][:, 0, 3]
     assert x == pytest.approx(alone, abs=0.2)
+
+
+def test_nobody_far_from_a_bend_is_in_its_corridor():
+    """A far place may be equally near to both ends of the piece of a line that is looked at."""
+    s_m = np.arange(0.0, 240.0, 2.0)  # a straight, a bend of 60 m radius, a straight
+    yaw = 2.0 * np.cumsum(np.where((s_m > 60.0) & (s_m < 180.0), 1 / 60.0, 0.0))
+    xy = np.cumsum(2.0 * np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0)
+    line = Lines([smooth_path(np.column_stack([xy, 0.0 * s_m]))])
+    n = 6000
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-350.0, 350.0, (n, 2))
+    turns = rng.uniform(-3.0, 3.0, n)
+    bodies = bodies_from(places, turns, [CAR] * n, np.zeros((n, 2)))
+    row = np.arange(n)
+    low, high = line.stations(0 * row, np.full(n, 10.0), np.full(n, 105.0))
+    span = spans(line, 0 * row, bodies, row, low, high)
+    inside = (span.low < 1.2) & (span.high > -1.2) & (span.rear > 10.0) & (span.rear < 105.0)
+    size = np.tile([CAR.length_m, CAR.width_m], (n, 1))
+    boxes = shapely.polygons(rectangle_corners(places, turns, size))
+    away_m = shapely.distance(boxes, shapely.linestrings(xy))
+    assert inside.any()
+    assert away_m[inside].max() < 1.5
