@@ -89,8 +89,8 @@ def paper(
     """Train the systems of the paper's tables at a stated budget, measure and drive them, and write
     the tables beside the printed ones, with a verdict on each claim.
 
-    Writes OUT/paper.json and OUT/paper.md. Each step is a command of its own below OUT/stages; what
-    is complete is reused, and an interrupted step goes on.
+    Writes OUT/paper.json, OUT/paper.md and OUT/figures. Each step is a command of its own below
+    OUT/stages; what is complete is reused, and an interrupted step goes on.
     """
     del debug
     read, document, _ = load_config(config)

@@ -314,8 +314,8 @@ def drive_rows(config: PaperConfig) -> list[str]:
 
 def _renderer(row: str, network: Network) -> str:
     steps = row.partition("@")[2]
-    bundle = f"[weights.bundle={network.path}]"
-    return f"{recipe_of(system_of(row)).fixer}{bundle}{'@' + steps if steps else ''}+{RAW}"
+    name = recipe_of(system_of(row)).fixer + (f"@{steps}" if steps else "")
+    return f"{name}[weights.bundle={network.path}]+{RAW}"
 
 
 def _updates(count: int) -> str:

@@ -24,6 +24,7 @@ from alpasim_plugin.lab.paper.comparison import (
     train_name,
 )
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig
+from alpasim_plugin.lab.paper.figures import write_figures
 from alpasim_plugin.lab.paper.printed import printed
 from alpasim_plugin.lab.paper.records import (
     QUALITY_FILE,
@@ -114,7 +115,7 @@ def experiment(
 def write_results(ready: Experiment) -> JsonObject:
     """Write tables and verdicts from the records of complete stages, and return them.
 
-    Writes ``paper.json`` and ``paper.md``.
+    Writes ``paper.json``, ``paper.md`` and the figures.
 
     Raises:
         InputError: A record is missing or of another program.
@@ -133,6 +134,7 @@ def write_results(ready: Experiment) -> JsonObject:
         "config": config.model_dump(),
         "source": printed().source,
         "tables": cells,
+        "figures": write_figures(config.labels, quality, ready.out),
         "claims": [item.as_dict() for item in decided],
     }
     write_json(ready.out / RECORD_FILE, record)

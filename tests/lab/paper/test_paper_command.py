@@ -8,7 +8,10 @@ import pytest
 
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError, Stopped
+from alpasim_plugin.core.parts import split_names
+from alpasim_plugin.core.parts.grammar import RendererName, parse_renderer
 from alpasim_plugin.lab.cli.training_options import Progress
+from alpasim_plugin.lab.paper.comparison import Effort, comparison
 from alpasim_plugin.lab.paper.config import load_config
 from alpasim_plugin.lab.paper.printed import printed
 
@@ -139,6 +142,22 @@ def test_the_shipped_configurations_hold_every_row_of_the_papers_tables(name):
     assert list(config.systems) == list(tables["cycle"].rows)
     assert list(config.ablation) == list(tables["ablation"].rows)
     assert list(config.drive.renderers) == list(tables["closed-loop"].rows)
+
+
+def test_the_renderers_of_the_closed_loop_are_understood():
+    """Weights are only named here: what counts is that each name means its fixer and its steps."""
+    config, _, _ = load_config("small")
+    drive = comparison(config, None, Effort())[-1]
+    words = drive.command[drive.command.index("--renderer") + 1]
+    systems = {"difix": "difix", "omnidreams@4": "omnidreams@4", "self-forcing": "self-forcing"}
+    systems["V9"] = "onefixer-dit-tiny"
+    names = split_names(words)
+    assert names[0] == "3dgs"
+    for name, (row, fixer) in zip(names[1:], systems.items(), strict=True):
+        parsed = parse_renderer(name, [fixer.partition("@")[0] for fixer in systems.values()])
+        plain, _, steps = fixer.partition("@")
+        bundle = f"weights.bundle={{train-{row.partition('@')[0]}}}/fixer.safetensors"
+        assert parsed == RendererName(plain, steps, (bundle,), "3dgs")
 
 
 def test_the_plan_of_a_shipped_configuration_says_power_and_what_is_left_out(tmp_path, capsys):
