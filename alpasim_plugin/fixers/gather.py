@@ -7,11 +7,13 @@ Equal to `network.pixel_generator.TORCH` to rounding, on float32 tensors without
 # Numba's decorators are untyped.
 # mypy: disable-error-code="no-untyped-def,no-untyped-call,untyped-decorator"
 
+import math
 from itertools import product
 
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from alpasim_plugin.core.kernels import inlined_kernel, kernel, vector_kernel
@@ -22,7 +24,9 @@ from alpasim_plugin.fixers.network.reference_blend import (
     DETAIL,
     FINER_PX,
     HALF,
+    MATCH_CELLS,
     NOWHERE,
+    OFFSET_PX,
     BlendHeads,
     Operations,
     ReferenceCells,
@@ -30,6 +34,8 @@ from alpasim_plugin.fixers.network.reference_blend import (
 from alpasim_plugin.gaussians.raster.stages import map_on_threads
 
 LARGEST = np.float32(60.0)  # logarithm of a weight: larger ones would overflow, and change nothing
+# The same of a weight that is next to nothing.
+LEAST = np.float32(-87.0)
 BAND = 8  # rows of a smaller image that are enlarged at a time
 
 
@@ -275,15 +281,41 @@ def _weigh_row(upper, lower, share_down, finer, i, k, looked_up, share, total):
         total: ``(W,)`` sum of weights, added to.
     """
     unit = np.float32(1.0)
-    zero = np.float32(0.0)
     largest = np.float32(LARGEST)
     nowhere = np.float32(NOWHERE)
     half = np.float32(0.5 / HALF)
     for x in range(len(share)):
-        logarithm = upper[3, x] + share_down * (lower[3, x] - upper[3, x])
-        logarithm = min(logarithm + (finer[i, x, k] if finer.size else zero), largest)
-        share[x] = np.exp(logarithm) * min(max(looked_up[3, x] * half, nowhere), unit)
+        share[x] = upper[3, x] + share_down * (lower[3, x] - upper[3, x])
+    if finer.size:
+        for x in range(len(share)):
+            share[x] += finer[i, x, k]
+    for x in range(len(share)):
+        weight = _exponential(min(share[x], largest))
+        share[x] = weight * min(max(looked_up[3, x] * half, nowhere), unit)
         total[x] += share[x]
+
+
+@inlined_kernel
+def _exponential(x):
+    """Return the exponential of a float32 to within a share of ``3e-7 + 1e-7 abs(x)``; below `LEAST`
+    that of `LEAST`.
+
+    A whole power of two, written as the exponent of a float, times a polynomial on [-1/2, 1/2]
+    (Taylor, degree 6, in the natural logarithm of two). Loops over it become vectors, over
+    ``np.exp`` they do not.
+    """
+    power = max(x, np.float32(LEAST)) * np.float32(1 / math.log(2))
+    whole = np.floor(power + np.float32(0.5))
+    rest = (power - whole) * np.float32(math.log(2))
+    value = np.float32(1 / 720)
+    value = value * rest + np.float32(1 / 120)
+    value = value * rest + np.float32(1 / 24)
+    value = value * rest + np.float32(1 / 6)
+    value = value * rest + np.float32(1 / 2)
+    value = value * rest + np.float32(1.0)
+    value = value * rest + np.float32(1.0)
+    exponent = (np.int32(whole) + np.int32(127)) << np.int32(23)
+    return value * np.int32(exponent).view(np.float32)
 
 
 @vector_kernel
@@ -435,4 +467,49 @@ def smaller(x: Tensor, scale: int) -> Tensor:
     return out
 
 
-CPU = Operations(gather_references, blend, smaller, enlarge, sparse_source)
+def likeness(sought: Tensor, candidates: Tensor) -> Tensor:
+    """Return the same as `network.reference_blend.likeness`."""
+    n, h, w, channels = candidates.shape
+    reach = 2 * MATCH_CELLS + 1
+    out = torch.empty(n, h, w, reach**2)
+    # Channels before columns, so that a row of cells is a vector.
+    around = F.pad(candidates, (0, 0, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS, MATCH_CELLS))
+    rows_sought, rows_around = (_array(x.transpose(2, 3)) for x in (sought, around))
+    _likeness(rows_sought, rows_around, np.float32(1 / channels), out.numpy())
+    return out.to(sought.dtype)
+
+
+@vector_kernel
+def _likeness(sought, around, share, out):
+    """Fill ``out`` ``(N, h, w, side * side)`` with the mean of products of ``sought``
+    ``(B, h, C, w)`` and what stands ``side * side`` cells around in ``around``
+    ``(N, h + side - 1, C, w + side - 1)``.
+    """
+    channels, width = sought.shape[2:]
+    count = len(around) // len(sought)
+    side = around.shape[3] - width + 1
+    sums = np.empty(width, dtype=np.float32)
+    for n in range(len(around)):
+        for y in range(sought.shape[1]):
+            here = sought[n // count, y]
+            for i in range(side):
+                there = around[n, y + i]
+                for j in range(side):
+                    sums[:] = np.float32(0.0)
+                    for c in range(channels):
+                        for x in range(width):
+                            sums[x] += here[c, x] * there[c, x + j]
+                    for x in range(width):
+                        out[n, y, x, i * side + j] = sums[x] * share
+
+
+def offsets(at2: Tensor, at4: Tensor) -> Tensor:
+    """Return the same as `network.reference_blend.offsets`."""
+    coarse = _array(at4)
+    out = np.empty(at2.shape, dtype=np.float32)
+    for i, plane in enumerate(coarse):
+        cv2.resize(plane, at2.shape[2:0:-1], dst=out[i], interpolation=cv2.INTER_LINEAR)
+    return torch.from_numpy(out).add_(at2).tanh_().mul_(OFFSET_PX)
+
+
+CPU = Operations(gather_references, blend, smaller, enlarge, likeness, offsets, sparse_source)

@@ -1,9 +1,10 @@
 """The fast gathering of what the generator reads equals the readable one."""
 
+import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.fixers.gather import CPU
+from alpasim_plugin.fixers.gather import CPU, LEAST, _exponential
 from alpasim_plugin.fixers.network.pixel_generator import TORCH
 from alpasim_plugin.fixers.network.reference_blend import (
     FINER_PX,
@@ -89,3 +90,36 @@ def test_bands_enlarge_as_the_operations_one_by_one(references, height, width, s
     if not references:  # the change of the render is all there is, here in the middle of squares
         due = rgb[:, 1::3, 1::3] + 127.5 * change[:, : height // 3, : width // 3]
         assert (one[:, 1::3, 1::3] - due.clamp(0, 255)).abs().max() <= 0.51
+
+
+@pytest.mark.parametrize(
+    ("batch", "references", "height", "width"), [(1, 1, 1, 1), (2, 3, 3, 7), (1, 2, 9, 40)]
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_references_are_compared_and_moved_as_by_the_operations_one_by_one(
+    batch, references, height, width, dtype
+):
+    draw = torch.Generator().manual_seed(width)
+
+    def features(count, scale, channels):
+        shape = count, scale * height, scale * width, channels
+        return torch.randn(shape, generator=draw).to(dtype)
+
+    count = batch * references
+    alike = features(batch, 1, 16), features(count, 1, 16)
+    # Columns of a wider tensor, as a network's heads are.
+    moved = features(count, 2, 5)[..., 1:3], features(count, 1, 2)
+    tolerance = 1e-5 if dtype == torch.float32 else 2e-2
+    for name, arguments in (("likeness", alike), ("offsets", moved)):
+        fast, plain = (getattr(operations, name)(*arguments) for operations in (CPU, TORCH))
+        assert fast.dtype == plain.dtype
+        assert fast.shape == plain.shape
+        assert torch.allclose(fast.float(), plain.float(), atol=tolerance, rtol=tolerance)
+
+
+def test_weights_are_exponentials_also_where_a_float_has_no_smaller_one():
+    values = np.linspace(-100, 60, 4001, dtype=np.float32)
+    made = np.array([_exponential(value) for value in values], dtype=np.float64)
+    due = np.exp(np.maximum(values, LEAST).astype(np.float64))
+    allowed = 3e-7 + 1e-7 * np.abs(values)
+    assert (np.abs(made / due - 1) < allowed).all()

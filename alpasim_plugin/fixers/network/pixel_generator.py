@@ -48,6 +48,8 @@ from alpasim_plugin.fixers.network.reference_blend import (
     blend,
     enlarge,
     gather_references,
+    likeness,
+    offsets,
     smaller,
 )
 
@@ -207,7 +209,7 @@ class Repaired(NamedTuple):
     heads: BlendHeads | None  # None without references
 
 
-TORCH = Operations(gather_references, blend, smaller, enlarge, dense_source)
+TORCH = Operations(gather_references, blend, smaller, enlarge, likeness, offsets, dense_source)
 
 
 class PixelGenerator(nn.Module):
@@ -344,7 +346,7 @@ class PixelGenerator(nn.Module):
         change = pixels(self.write(fine), DETAIL).float()
         heads = None
         if self.blend is not None and reference_cells is not None:
-            heads = self.blend(y, fine, reference_cells)
+            heads = self.blend(y, fine, reference_cells, operations)
         return Repaired(render + change, hidden, heads)
 
     @classmethod

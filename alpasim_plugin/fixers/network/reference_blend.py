@@ -86,6 +86,8 @@ class Operations:
         blend: See `blend`.
         smaller: See `smaller`.
         enlarge: See `enlarge`.
+        likeness: See `likeness`.
+        offsets: See `offsets`.
         source: Fill what is transparent with noise; see `pixel_generator.sparse_source`.
     """
 
@@ -93,6 +95,8 @@ class Operations:
     blend: Callable[[Tensor, Tensor, BlendHeads], tuple[Tensor, Tensor]]
     smaller: Callable[[Tensor, int], Tensor]
     enlarge: Callable[[Tensor, Tensor, Tensor | None, BlendHeads | None, int], Tensor]
+    likeness: Callable[[Tensor, Tensor], Tensor]
+    offsets: Callable[[Tensor, Tensor], Tensor]
     source: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -134,25 +138,28 @@ class ReferenceBlend(nn.Module):
         dtype = self.stem.weight.dtype
         return self.stem(cells.mean4.to(dtype)), self.read(cells.mean2.to(dtype))
 
-    def forward(self, y: Tensor, fine: Tensor, cells: ReferenceCells) -> BlendHeads:
+    def forward(
+        self, y: Tensor, fine: Tensor, cells: ReferenceCells, operations: Operations
+    ) -> BlendHeads:
         """Return how every reference enters the image.
 
         Args:
             y: ``(B, H / 4, W / 4, coarse)`` the U-Net's features.
             fine: ``(B, H / 2, W / 2, detail)`` the detail path's features.
             cells: What the references show.
+            operations: For the device.
         """
         b = y.shape[0]
         k = cells.each4.shape[0] // b
         side = activation(_add_to_each(self.coarse(cells.each4.to(y.dtype)), y), inplace=True)
-        alike = likeness(self.sought(y), self.shown(side))
+        alike = operations.likeness(self.sought(y), self.shown(side))
         at4 = activation(self.align[0](side) + self.match(alike), inplace=True)
         at4 = activation(self.align[1](at4), inplace=True)
         joined = _add_to_each(self.own(cells.each2.to(fine.dtype)).add_(self.up(at4)), fine)
         features = activation(self.head(activation(joined, inplace=True)), inplace=True)
         heads = self.write(features).unflatten(0, (b, k))
         weight, offset, correction = heads.split([DETAIL**2, 2, DETAIL**2 * 3], dim=-1)
-        moved = offsets(offset.flatten(0, 1), self.shift(at4))
+        moved = operations.offsets(offset.flatten(0, 1), self.shift(at4))
         return BlendHeads(weight, moved.view(offset.shape), correction)
 
 
