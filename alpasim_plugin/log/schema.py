@@ -26,7 +26,7 @@ from alpasim_plugin.core.types import (
     Vehicle,
 )
 from alpasim_plugin.log.images import ImageEncoding
-from alpasim_plugin.log.packed_poses import packed_trajectories
+from alpasim_plugin.log.packed_poses import packed_trajectories, unpacked_trajectory
 from alpasim_plugin.log.wire import common_pb2, egodriver_pb2, sensorsim_pb2, traffic_pb2
 
 DIGEST_BITS = 58
@@ -352,7 +352,11 @@ def read_poses(poses: Iterable[common_pb2.Pose], name: str) -> tuple[F64, F64]:
     """
     # Each attribute access makes a Python object, so vec and quat are fetched once a pose.
     rows = [(v.x, v.y, v.z, q.w, q.x, q.y, q.z) for v, q in ((p.vec, p.quat) for p in poses)]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    return _checked_poses(np.array(rows, dtype=np.float64).reshape(-1, 7), name)
+
+
+def _checked_poses(table: F64, name: str) -> tuple[F64, F64]:
+    """Return the positions and unit quaternions of rows ``(N, 7)``; see `read_poses`."""
     xyz = table[:, :3]
     quat = table[:, 3:]
     square = np.sum(quat * quat, axis=1)
@@ -372,8 +376,14 @@ def read_trajectory(message: common_pb2.Trajectory, name: str) -> Trajectory:
     Raises:
         InputError: Times do not increase strictly, or a pose is bad (see `read_poses`).
     """
-    t_us = increasing_times([pose.timestamp_us for pose in message.poses], name)
-    xyz, quat = read_poses((pose.pose for pose in message.poses), name)
+    numbers = unpacked_trajectory(message)
+    if numbers is None:
+        t_us = increasing_times([pose.timestamp_us for pose in message.poses], name)
+        xyz, quat = read_poses((pose.pose for pose in message.poses), name)
+    else:
+        table, times = numbers
+        t_us = increasing_times(times.tolist(), name)
+        xyz, quat = _checked_poses(table, name)
     return Trajectory(t_us, xyz, quat)
 
 

@@ -9,7 +9,15 @@ from scipy.spatial.transform import Rotation
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import quat_from_matrix, rigid
 from alpasim_plugin.core.types import Trajectory
-from alpasim_plugin.log.schema import trajectory_bytes, wire_pose, wire_poses, wire_trajectory
+from alpasim_plugin.log import schema
+from alpasim_plugin.log.packed_poses import unpacked_trajectory
+from alpasim_plugin.log.schema import (
+    read_trajectory,
+    trajectory_bytes,
+    wire_pose,
+    wire_poses,
+    wire_trajectory,
+)
 from alpasim_plugin.log.wire import common_pb2
 
 
@@ -75,3 +83,60 @@ def test_a_time_before_zero_is_refused():
     early = Trajectory(np.array([-5, 0, 3], dtype=np.int64), one.xyz, one.quat)
     with pytest.raises(InputError, match="-5 us"):
         trajectory_bytes([early], "a plan")
+
+
+def flat(length):
+    """Return a trajectory on a plane: protobuf leaves its zeros out."""
+    one = trajectory(length)
+    yaw = np.linspace(0.1, 2.0, length)
+    quat = np.stack([np.cos(yaw), 0 * yaw, 0 * yaw, np.sin(yaw)], axis=1)
+    return Trajectory(one.t_us, one.xyz * [1, 1, 0] + 0.0, quat)
+
+
+def with_numbers(one, xyz):
+    changed = one.xyz.copy()
+    changed[:] = xyz(changed)
+    return Trajectory(one.t_us, changed, one.quat)
+
+
+@pytest.mark.parametrize(
+    ("one", "is_fast"),
+    [
+        (trajectory(65), True),
+        (flat(65), True),
+        (flat(1), True),
+        (with_numbers(flat(9), np.zeros_like), True),
+        (with_numbers(flat(9), lambda xyz: xyz * (np.arange(9) > 0)[:, None] + 0.0), False),
+        # as many bytes in each pose, of other numbers
+        (with_numbers(flat(2), lambda xyz: xyz * [[0, 1, 1], [1, 0, 1]] + 0.0), False),
+        (with_numbers(flat(9), lambda xyz: np.full_like(xyz, -0.0)), False),
+        (trajectory(0), False),
+    ],
+)
+def test_a_trajectory_is_read_as_its_objects_one_by_one(one, is_fast, monkeypatch):
+    message = common_pb2.Trajectory.FromString(built_one_by_one(one).SerializeToString())
+    assert (unpacked_trajectory(message) is not None) == is_fast
+    fast = read_trajectory(message, "a trajectory")
+    monkeypatch.setattr(schema, "unpacked_trajectory", lambda message: None)
+    plain = read_trajectory(message, "a trajectory")
+    for name in ("t_us", "xyz", "quat"):
+        assert getattr(fast, name).dtype == getattr(plain, name).dtype
+        np.testing.assert_array_equal(getattr(fast, name), getattr(plain, name))
+
+
+@pytest.mark.parametrize("times", [[5, 5], [7, 3], [1, 2**63 + 1]])
+def test_times_that_do_not_increase_are_refused_in_both_ways(times):
+    message = built_one_by_one(flat(2))
+    for pose, t_us in zip(message.poses, times, strict=True):
+        pose.timestamp_us = t_us
+    assert unpacked_trajectory(message) is not None
+    with pytest.raises(InputError, match=f"time {times[1]} us at index 1 after {times[0]} us"):
+        read_trajectory(message, "a plan")
+
+
+def test_a_pose_without_rotation_is_refused_in_both_ways():
+    message = built_one_by_one(flat(3))
+    for pose in message.poses:
+        pose.pose.quat.Clear()
+    with pytest.raises(InputError, match="pose 0: position"):
+        read_trajectory(message, "a plan")
