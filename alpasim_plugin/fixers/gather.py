@@ -306,14 +306,14 @@ def _exponential(x):
     """
     power = max(x, np.float32(LEAST)) * np.float32(1 / math.log(2))
     whole = np.floor(power + np.float32(0.5))
-    rest = (power - whole) * np.float32(math.log(2))
+    fraction = (power - whole) * np.float32(math.log(2))
     value = np.float32(1 / 720)
-    value = value * rest + np.float32(1 / 120)
-    value = value * rest + np.float32(1 / 24)
-    value = value * rest + np.float32(1 / 6)
-    value = value * rest + np.float32(1 / 2)
-    value = value * rest + np.float32(1.0)
-    value = value * rest + np.float32(1.0)
+    value = value * fraction + np.float32(1 / 120)
+    value = value * fraction + np.float32(1 / 24)
+    value = value * fraction + np.float32(1 / 6)
+    value = value * fraction + np.float32(1 / 2)
+    value = value * fraction + np.float32(1.0)
+    value = value * fraction + np.float32(1.0)
     exponent = (np.int32(whole) + np.int32(127)) << np.int32(23)
     return value * np.int32(exponent).view(np.float32)
 
@@ -491,14 +491,14 @@ def _likeness(sought, around, share, out):
     sums = np.empty(width, dtype=np.float32)
     for n in range(len(around)):
         for y in range(sought.shape[1]):
-            here = sought[n // count, y]
+            cells = sought[n // count, y]
             for i in range(side):
-                there = around[n, y + i]
+                around_cells = around[n, y + i]
                 for j in range(side):
                     sums[:] = np.float32(0.0)
                     for c in range(channels):
                         for x in range(width):
-                            sums[x] += here[c, x] * there[c, x + j]
+                            sums[x] += cells[c, x] * around_cells[c, x + j]
                     for x in range(width):
                         out[n, y, x, i * side + j] = sums[x] * share
 
