@@ -18,7 +18,6 @@ while a shutter is open needs three numbers more.
 
 import numpy as np
 
-from alpasim_plugin.cameras.image_map import DEGREE
 from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.gaussians.constants import (
     EPS2D_PX2,
@@ -33,189 +32,81 @@ from alpasim_plugin.gaussians.constants import (
     POSE_ROTATION,
     POSE_SHIFT,
     POSE_TURN,
-    TILE,
-    TIME_STEPS,
 )
 from alpasim_plugin.gaussians.raster import simd as v
+from alpasim_plugin.gaussians.raster.lens_map_kernels import (
+    added,
+    moved_at,
+    pixels_per_radian,
+    place_on_sphere,
+    scaled,
+    shown,
+    tangents,
+    time_seen,
+)
 from alpasim_plugin.gaussians.raster.lens_rays import (
-    LENS_BENDS,
     LENS_COS,
-    LENS_G,
     LENS_HEIGHT,
     LENS_LEAST,
-    LENS_LINEAR,
     LENS_MARGIN,
-    LENS_MIDDLE,
     LENS_MOST,
     LENS_ROLLS,
     LENS_S_MOST,
     LENS_SIN,
-    LENS_SLOPE,
     LENS_TIME,
     LENS_WIDTH,
 )
+from alpasim_plugin.gaussians.raster.lens_records import (
+    BOTTOM,
+    COLUMNS,
+    CUT_SIGMA,
+    DEPTH,
+    DISTANCE,
+    INVERSE_O2,
+    KEY,
+    LEFT,
+    NODE,
+    PASSED,
+    PEAK,
+    RIGHT,
+    ROW_A,
+    ROW_B,
+    ROW_C,
+    ROW_S,
+    SHORT,
+    TOP,
+    store3,
+    write_record,
+)
+from alpasim_plugin.gaussians.raster.lens_small_kernels import is_small, write_small
+from alpasim_plugin.gaussians.raster.lens_touch_kernels import CLOSE
 from alpasim_plugin.gaussians.raster.project_kernels import (
     CHUNK,
     colour_group,
-    cross,
     dot,
     load3,
     row,
 )
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT
 
-# A record: columns 6 to 8 are the colour; from 16 on for rolling shutters alone.
-ROW_A, ROW_B, ROW_C = 0, 3, 9
-INVERSE_O2, PEAK, DEPTH, CUT_SIGMA = 12, 13, 14, 15
-ROW_S = 16  # s1, s2, s3 of the motion in a whole shutter
-NODE, DISTANCE = 25, 26  # the place of its motion, -1: it does not turn; n
-PASSED = 27  # 1: the camera may pass it, or be in it, while the shutter is open
-SHORT, LONG = 16, 32  # numbers of a record
-# further columns of the lanes in which sixteen records are made
-LEFT, RIGHT, TOP, BOTTOM, KEY = range(LONG, LONG + 5)
-COLUMNS = LONG + 5
 # Eight directions of the outline, of which four are the others turned about; a polygon around it.
 COS = np.cos(np.arange(4) * np.pi / 4)
 SIN = np.sin(np.arange(4) * np.pi / 4)
 AROUND = float(1 / np.cos(np.pi / 8))
-CLOSE = 0.95  # of (t / o)^2: the camera lies within the drawn ellipsoid, or nearly
 WIDE = 0.2  # of (half axis / distance)^2: the outline is too wide for eight directions
-LEAST_SLOPE = 0.05  # of the pixels per radian along the radius to those across
+SMALL_SHIFTS = 8.0  # nearer than so many shifts of a shutter nothing is small
 NEAR_SHIFTS = 1.5  # nearer than so many shifts of a shutter a Gaussian is looked for everywhere
 LATE = 0.75
 EVERY = 1.0e9
 
 
 @kernel
-def _scaled(a, k):
-    return a[0] * k, a[1] * k, a[2] * k
-
-
-@kernel
-def _added(a, b):
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-@kernel
-def _polynomial(lens, first, degree, s):
-    x = v.fma(s, 2.0 / lens[LENS_S_MOST], -1.0)
-    value = v.fma(x, lens[first + degree], lens[first + degree - 1])
-    for k in range(degree - 2, -1, -1):
-        value = v.fma(value, x, lens[first + k])
-    return value
-
-
-@kernel
-def _place_on_sphere(lens, p):
-    """Return h of points, held to where the lens is described, its s and that before."""
-    n = v.sqrt(dot(p, p))
-    inverse = 1.0 / v.maximum(n + p[2], 1e-6 * n + 1e-30)
-    hx = p[0] * inverse
-    hy = p[1] * inverse
-    s = v.fma(hx, hx, hy * hy)
-    held = v.minimum(s, lens[LENS_S_MOST])
-    shrink = v.sqrt(held / v.maximum(s, 1e-30))
-    return (hx * shrink, hy * shrink), held, s
-
-
-@kernel
-def _bent(lens, x, y):
-    """Return what the tangential and thin prism terms add at tangents x, y."""
-    k = LENS_BENDS + 1
-    r2 = v.fma(x, x, y * y)
-    xy = x * y
-    radial_x = r2 * v.fma(r2, lens[k + 3], lens[k + 2])
-    radial_y = r2 * v.fma(r2, lens[k + 5], lens[k + 4])
-    bent_x = radial_x + 2.0 * lens[k] * xy + lens[k + 1] * v.fma(2.0 * x, x, r2)
-    bent_y = radial_y + lens[k] * v.fma(2.0 * y, y, r2) + 2.0 * lens[k + 1] * xy
-    return bent_x, bent_y
-
-
-@kernel
-def shown(lens, p):
-    """Return the pixels ``u, v`` at which a lens shows points, and their s."""
-    h, held, s = _place_on_sphere(lens, p)
-    g = _polynomial(lens, LENS_G, DEGREE, held)
-    x = h[0] * g
-    y = h[1] * g
-    if lens[LENS_BENDS] > 0:
-        k = 2.0 / (1.0 - held)
-        bent_x, bent_y = _bent(lens, h[0] * k, h[1] * k)
-        x = x + bent_x
-        y = y + bent_y
-    a = LENS_LINEAR
-    u = v.fma(x, lens[a], v.fma(y, lens[a + 1], lens[LENS_MIDDLE]))
-    w = v.fma(x, lens[a + 2], v.fma(y, lens[a + 3], lens[LENS_MIDDLE + 1]))
-    return u, w, s
-
-
-@kernel
-def _times_bent(lens, h, held, j):
-    """Return a Jacobian by h with that of the tangential and thin prism terms added."""
-    k = LENS_BENDS + 1
-    p1, p2 = lens[k], lens[k + 1]
-    t = 2.0 / (1.0 - held)
-    x = h[0] * t
-    y = h[1] * t
-    r2 = v.fma(x, x, y * y)
-    fx = v.fma(r2, 4.0 * lens[k + 3], 2.0 * lens[k + 2])
-    fy = v.fma(r2, 4.0 * lens[k + 5], 2.0 * lens[k + 4])
-    xx = 2.0 * p1 * y + 6.0 * p2 * x + fx * x
-    xy = 2.0 * p1 * x + 2.0 * p2 * y + fx * y
-    yx = 2.0 * p1 * x + 2.0 * p2 * y + fy * x
-    yy = 6.0 * p1 * y + 2.0 * p2 * x + fy * y
-    # of the tangents by h: t I + t^2 h h^T
-    d00 = v.fma(x, x, t)
-    d01 = x * y
-    d11 = v.fma(y, y, t)
-    return (
-        j[0] + xx * d00 + xy * d01,
-        j[1] + xx * d01 + xy * d11,
-        j[2] + yx * d00 + yy * d01,
-        j[3] + yx * d01 + yy * d11,
-    )
-
-
-@kernel
-def _pixels_per_radian(lens, h, held):
-    """Return the derivative of the pixel by the two tangents of `_tangents`, row by row."""
-    g = _polynomial(lens, LENS_G, DEGREE, held)
-    slope = 2.0 * _polynomial(lens, LENS_SLOPE, DEGREE - 1, held)
-    slope = v.maximum(slope, (LEAST_SLOPE - 1.0) * g / v.maximum(held, 1e-12))
-    mixed = slope * h[0] * h[1]
-    j = v.fma(slope * h[0], h[0], g), mixed, mixed, v.fma(slope * h[1], h[1], g)
-    if lens[LENS_BENDS] > 0:
-        j = _times_bent(lens, h, held, j)
-    a = LENS_LINEAR
-    k = v.fma(held, 0.5, 0.5)
-    return (
-        k * (lens[a] * j[0] + lens[a + 1] * j[2]),
-        k * (lens[a] * j[1] + lens[a + 1] * j[3]),
-        k * (lens[a + 2] * j[0] + lens[a + 3] * j[2]),
-        k * (lens[a + 2] * j[1] + lens[a + 3] * j[3]),
-    )
-
-
-@kernel
-def _tangents(p, n):
-    """Return two unit vectors across the directions of points, along h's axes."""
-    inverse = 1.0 / v.maximum(n + p[2], 1e-7 * n)
-    hx = p[0] * inverse
-    hy = p[1] * inverse
-    k = 2.0 / (v.fma(hx, hx, hy * hy) + 1.0)
-    mixed = v.negative(k * hx * hy)
-    right = v.fnma(k * hx, hx, 1.0), mixed, v.negative(k * hx)
-    down = mixed, v.fnma(k * hy, hy, 1.0), v.negative(k * hy)
-    return right, down
-
-
-@kernel
 def _covariance(geometry, geo, pose):
     """Return the six numbers of the covariance of sixteen Gaussians in the camera's axes."""
     f = geo + GEO_FACTOR * 16
-    first = _as_f64(load3(geometry, f))
-    second = _as_f64(load3(geometry, f + 48))
-    third = _as_f64(load3(geometry, f + 96))
+    first = as_f64(load3(geometry, f))
+    second = as_f64(load3(geometry, f + 48))
+    third = as_f64(load3(geometry, f + 96))
     x = _combined(row(pose, POSE_ROTATION), first, second, third)
     y = _combined(row(pose, POSE_ROTATION + 3), first, second, third)
     z = _combined(row(pose, POSE_ROTATION + 6), first, second, third)
@@ -223,13 +114,14 @@ def _covariance(geometry, geo, pose):
 
 
 @kernel
-def _as_f64(a):
+def as_f64(a):
+    """Return a vector of three in float64."""
     return v.to_f64(a[0]), v.to_f64(a[1]), v.to_f64(a[2])
 
 
 @kernel
 def _combined(weights, a, b, c):
-    return _added(_added(_scaled(a, weights[0]), _scaled(b, weights[1])), _scaled(c, weights[2]))
+    return added(added(scaled(a, weights[0]), scaled(b, weights[1])), scaled(c, weights[2]))
 
 
 @kernel
@@ -260,6 +152,9 @@ def _kept_share(s, right, down, k, eps, n2):
     """Return the share of the determinants of the covariances in the image, without and with the
     low-pass; see Mip-Splatting.
     """
+    k = v.to_f64(k[0]), v.to_f64(k[1]), v.to_f64(k[2]), v.to_f64(k[3])
+    right = as_f64(right)
+    down = as_f64(down)
     sr = _times(s, right)
     sd = _times(s, down)
     rr = dot(sr, right)
@@ -275,15 +170,15 @@ def _kept_share(s, right, down, k, eps, n2):
 
 @kernel
 def _low_passed(s, p, n2, right, down, k, eps):
-    """Return the covariance with that of the pixel at the mean's place."""
+    """Return the covariance with that of the pixel at the mean's place ``p``, float32."""
     determinant = 1.0 / (k[0] * k[3] - k[1] * k[2])
     scale = v.sqrt(n2 * eps) * determinant
     m00, m01 = k[3] * scale, v.negative(k[1] * scale)
     m10, m11 = v.negative(k[2] * scale), k[0] * scale
-    s = _with_square(s, _added(_scaled(right, m00), _scaled(down, m10)))
-    s = _with_square(s, _added(_scaled(right, m01), _scaled(down, m11)))
+    s = _with_square(s, as_f64(added(scaled(right, m00), scaled(down, m10))))
+    s = _with_square(s, as_f64(added(scaled(right, m01), scaled(down, m11))))
     size = v.sqrt(0.5 * (m00 * m00 + m01 * m01 + m10 * m10 + m11 * m11) / n2)
-    return _with_square(s, _scaled(p, size))
+    return _with_square(s, as_f64(scaled(p, size)))
 
 
 @kernel
@@ -315,7 +210,7 @@ def _row_solved(lower, inverses, q, k):
     z = q[2] * inverses[2]
     y = v.fnma(lower[4], z, q[1]) * inverses[1]
     x = v.fnma(lower[3], z, v.fnma(lower[1], y, q[0])) * inverses[0]
-    return _scaled((x, y, z), k)
+    return scaled((x, y, z), k)
 
 
 @kernel
@@ -342,43 +237,21 @@ def _basis(w):
 
 
 @kernel
-def _at_its_time(p, pose, lens):
-    """Return where points are, in camera axes, when the row that shows them is exposed."""
-    shift = row(pose, POSE_SHIFT)
-    turn = row(pose, POSE_TURN)
-    turned = cross(turn, p)
-    first = turned[0] + shift[0], turned[1] + shift[1], turned[2] + shift[2]
-    second = _scaled(cross(turn, first), 0.5)
-    place = p
-    for _ in range(TIME_STEPS):
-        u, w, _ = shown(lens, place)
-        time = v.fma(u, lens[LENS_TIME], v.fma(w, lens[LENS_TIME + 1], lens[LENS_TIME + 2]))
-        time = v.minimum(v.maximum(time, -0.5), 0.5)
-        place = (
-            v.fma(time, v.fma(time, second[0], first[0]), p[0]),
-            v.fma(time, v.fma(time, second[1], first[1]), p[1]),
-            v.fma(time, v.fma(time, second[2], first[2]), p[2]),
-        )
-    return place
-
-
-@kernel
 def _write_box(lanes, lens, place, n, first, second, moves):
     """Write the boxes of the outlines ``place + cos first + sin second``; returns the bits of those
     that are in the image, and of those to be looked for everywhere.
 
     An outline between its eight directions bends by no more than its middle misses the mean.
     """
-    mean = v.to_f32(place[0]), v.to_f32(place[1]), v.to_f32(place[2])
     a = v.to_f32(first[0]), v.to_f32(first[1]), v.to_f32(first[2])
     b = v.to_f32(second[0]), v.to_f32(second[1]), v.to_f32(second[2])
-    u, w, s = shown(lens, mean)
+    u, w, s = shown(lens, place)
     left, right, top, bottom = u, u, w, w
     bend_u, bend_w = v.absolute(u * 0.0), v.absolute(u * 0.0)
     for k in range(4):
-        step = _added(_scaled(a, COS[k]), _scaled(b, SIN[k]))
-        u1, w1, s1 = shown(lens, _added(mean, step))
-        u2, w2, s2 = shown(lens, _added(mean, _scaled(step, -1.0)))
+        step = added(scaled(a, COS[k]), scaled(b, SIN[k]))
+        u1, w1, s1 = shown(lens, added(place, step))
+        u2, w2, s2 = shown(lens, added(place, scaled(step, -1.0)))
         left = v.minimum(left, v.minimum(u1, u2))
         right = v.maximum(right, v.maximum(u1, u2))
         top = v.minimum(top, v.minimum(w1, w2))
@@ -409,12 +282,6 @@ def _write_box(lanes, lens, place, n, first, second, moves):
 
 
 @kernel
-def _store3(lanes, column, a):
-    for k in range(3):
-        v.store(lanes, (column + k) * 16, v.to_f32(a[k]))
-
-
-@kernel
 def _in_cone(p, reach, lens):
     """Return which points may lie no farther than ``reach`` outside the cone that the image shows."""
     across = v.sqrt(v.fma(p[0], p[0], p[1] * p[1]))
@@ -438,15 +305,16 @@ def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, mov
     eps = antialias if antialias > 0 else EPS2D_PX2
     t = v.to_f64(v.load(geometry, geo + GEO_EXTENT * 16))
     at_n2 = dot(place, place)
+    n2 = v.to_f64(at_n2)
     at_n = v.sqrt(at_n2)
-    h, held, _ = _place_on_sphere(lens, place)
-    k = _pixels_per_radian(lens, h, held)
-    right, down = _tangents(place, at_n)
+    h, held, _ = place_on_sphere(lens, place)
+    k = pixels_per_radian(lens, h, held)
+    right, down = tangents(place, at_n)
     s = _covariance(geometry, geo, pose)
     peak = v.load(geometry, geo + GEO_PEAK * 16)
     chosen = v.bits(mask)
     if antialias > 0:
-        v.store(lanes, PEAK * 16, v.to_f32(_kept_share(s, right, down, k, eps, at_n2)))
+        v.store(lanes, PEAK * 16, v.to_f32(_kept_share(s, right, down, k, eps, n2)))
         for lane in range(PEAK * 16, PEAK * 16 + 16):
             lanes[lane] = np.log2(lanes[lane]) / 16
         peak = peak + v.load(lanes, PEAK * 16)
@@ -456,14 +324,14 @@ def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, mov
     w = _solved(lower, inverses, p)
     o2 = dot(w, w)
     inverse_o = 1.0 / v.sqrt(o2)
-    w = _scaled(w, inverse_o)
+    w = scaled(w, inverse_o)
     q1, q2 = _basis(w)
     first = _spread(lower, q1)
     second = _spread(lower, q2)
     ratio = t * t / o2
     out = AROUND * t / v.sqrt(v.maximum(1.0 - ratio, 1.0 - CLOSE))
     size2 = v.maximum(dot(first, first), dot(second, second)) * out * out
-    boxed = _write_box(lanes, lens, place, n, _scaled(first, out), _scaled(second, out), moves)
+    boxed = _write_box(lanes, lens, place, n, scaled(first, out), scaled(second, out), moves)
     everywhere = boxed[1] | v.bits(ratio >= CLOSE) | v.bits(size2 > WIDE * n * n)
     if lens[LENS_ROLLS] > 0:
         everywhere |= _write_passed(lanes, lower, inverses, pose, v.sqrt(o2), t)
@@ -471,17 +339,17 @@ def _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, mov
     if chosen == 0:
         return 0
     _list_everywhere(lanes, everywhere)
-    _store3(lanes, ROW_A, _row_solved(lower, inverses, q1, n))
-    _store3(lanes, ROW_B, _row_solved(lower, inverses, q2, n))
-    _store3(lanes, ROW_C, _row_solved(lower, inverses, w, n * inverse_o))
+    store3(lanes, ROW_A, _row_solved(lower, inverses, q1, n))
+    store3(lanes, ROW_B, _row_solved(lower, inverses, q2, n))
+    store3(lanes, ROW_C, _row_solved(lower, inverses, w, n * inverse_o))
     v.store(lanes, INVERSE_O2 * 16, v.to_f32(1.0 / o2))
     v.store(lanes, PEAK * 16, peak)
-    v.store(lanes, DEPTH * 16, v.to_f32(at_n))
+    v.store(lanes, DEPTH * 16, at_n)
     v.store(lanes, CUT_SIGMA * 16, v.to_f32(t))
     if lens[LENS_ROLLS] > 0:
         zero = n * 0.0
         s = _solved(lower, inverses, (zero + moved[0], zero + moved[1], zero + moved[2]))
-        _store3(lanes, ROW_S, (dot(s, q1), dot(s, q2), dot(s, w) * inverse_o))
+        store3(lanes, ROW_S, (dot(s, q1), dot(s, q2), dot(s, w) * inverse_o))
         v.store(lanes, DISTANCE * 16, v.to_f32(n))
     return chosen
 
@@ -519,10 +387,11 @@ def _list_everywhere(lanes, everywhere):
 
 
 @kernel
-def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, moved, lanes):
-    """Project sixteen Gaussians into ``lanes`` and return the bit mask of those that reach the
-    image.
+def _project_group(cursor, group, arrays, pose, lens, moves, moving, lanes, out):
+    """Project sixteen Gaussians and append those that reach the image: small ones as ellipses, the
+    others with their rows.
     """
+    means, geometry, sh, sh_size = arrays
     x, y, z = load3(means, group * 48)
     d = x - pose[POSE_CENTRE], y - pose[POSE_CENTRE + 1], z - pose[POSE_CENTRE + 2]
     p = (
@@ -533,28 +402,54 @@ def _project_group(group, means, geometry, sh, sh_size, pose, lens, moves, moved
     n = v.sqrt(dot(p, p))
     geo = group * (GEO_SIZE * 16)
     t = v.to_f64(v.load(geometry, geo + GEO_EXTENT * 16))
-    low_pass = 1.5 * np.sqrt(max(pose[POSE_ANTIALIAS], EPS2D_PX2)) / lens[LENS_LEAST]
-    reach = t * v.fma(n, low_pass, _size(geometry, geo))
+    low_pass = np.sqrt(max(pose[POSE_ANTIALIAS], EPS2D_PX2)) / lens[LENS_LEAST]
+    reach = t * v.fma(n, 1.5 * low_pass, _size(geometry, geo))
     reach = reach + 0.5 * v.fma(n, moves[0], moves[1])
     mask = (n >= pose[POSE_NEAR]) & (n <= pose[POSE_FAR]) & _in_cone(p, reach, lens)
-    if v.bits(mask) == 0:
-        return 0
-    place = p
+    remaining = v.bits(mask)
+    if remaining == 0:
+        return
+    p32 = v.to_f32(p[0]), v.to_f32(p[1]), v.to_f32(p[2])
+    small = mask & (n >= SMALL_SHIFTS * moves[1])
+    small = small & is_small(lens, pose, geometry, geo, p32, low_pass, moves)
+    d32 = v.to_f32(d[0]), v.to_f32(d[1]), v.to_f32(d[2])
+    largest = v.maximum(v.maximum(v.absolute(p[0]), v.absolute(p[1])), v.absolute(p[2]))
+    v.store(lanes, KEY * 16, v.to_f32(largest))
+    is_coloured = False
+    if v.bits(small) != 0:
+        taken, chosen = write_small(lanes, lens, pose, moving, geometry, geo, p32, small)
+        remaining &= ~taken
+        if chosen != 0:
+            colour_group(group, d32, sh, sh_size, lanes)
+            is_coloured = True
+            _append(cursor, group, chosen, SHORT, lens, lanes, out)
+    if remaining == 0:
+        return
+    place = p32
     if lens[LENS_ROLLS] > 0:
-        place = _at_its_time(p, pose, lens)
-    chosen = _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, moved)
+        place, _ = moved_at(p32, moving, lens, time_seen(lens, moving, p32, 0.5))
+    chosen = (
+        _write_shape(lanes, lens, pose, geometry, geo, p, place, n, mask, moves, moving[0])
+        & remaining
+    )
     if chosen != 0:
-        largest = v.maximum(v.maximum(v.absolute(p[0]), v.absolute(p[1])), v.absolute(p[2]))
-        v.store(lanes, KEY * 16, v.to_f32(largest))
-        d32 = v.to_f32(d[0]), v.to_f32(d[1]), v.to_f32(d[2])
-        colour_group(group, d32, sh, sh_size, lanes)
-    return chosen
+        if not is_coloured:
+            colour_group(group, d32, sh, sh_size, lanes)
+        _append(cursor, group, chosen, out[0], lens, lanes, out)
 
 
 @kernel
-def _tile_number(place, n_tiles):
-    """Return the tile of a place in pixels, held to 0..n_tiles; rounded down."""
-    return np.int16(min(max(place / TILE, 0.0), np.float64(n_tiles)))
+def _append(cursor, group, chosen, columns, lens, lanes, out):
+    """Append the records of lanes."""
+    size, index, first_id, records, boxes, keys, ids = out
+    place = v.fetch_add(cursor, 0, _count(chosen))
+    while chosen != 0:
+        lane = v.lowest_bit(chosen)
+        chosen &= chosen - 1
+        write_record(lanes, lane, lens, place, (size, columns), records, boxes)
+        keys[place] = lanes[KEY * 16 + lane]
+        ids[place] = index[group * 16 + lane] + first_id
+        place += 1
 
 
 @kernel
@@ -564,19 +459,6 @@ def _count(bits):
         bits &= bits - 1
         count += 1
     return count
-
-
-@kernel
-def _write_record(lanes, lane, lens, out, size, records, boxes):
-    """Write the record and the tiles of the box of a lane's Gaussian."""
-    for column in range(size):
-        records[out * size + column] = lanes[column * 16 + lane]
-    tiles_x = -(-int(lens[LENS_WIDTH]) // TILE)
-    tiles_y = -(-int(lens[LENS_HEIGHT]) // TILE)
-    boxes[out, 0] = _tile_number(lanes[LEFT * 16 + lane] - 0.5, tiles_x)
-    boxes[out, 1] = _tile_number(lanes[RIGHT * 16 + lane] - 0.5 + TILE, tiles_x)
-    boxes[out, 2] = _tile_number(lanes[TOP * 16 + lane] - 0.5, tiles_y)
-    boxes[out, 3] = _tile_number(lanes[BOTTOM * 16 + lane] - 0.5 + TILE, tiles_y)
 
 
 @kernel
@@ -592,6 +474,7 @@ def project_lens_part(
     pose,
     node,
     moved,
+    motion,
     lens,
     size,
     records,
@@ -607,6 +490,7 @@ def project_lens_part(
             `project_kernels.project_part`.
         node: Place of the part's motion, -1: it does not turn in the world.
         moved: float64 ``(3,)``, by how much the camera moves in a shutter as the part sees it.
+        motion: float32, `MOTION` numbers a moving node.
         lens: float64 ``(LENS_SIZE,)``.
         size: Numbers of a record.
         records: float32 output, ``size`` per splat.
@@ -623,6 +507,9 @@ def project_lens_part(
         np.sqrt(shift[0] ** 2 + shift[1] ** 2 + shift[2] ** 2),
     )
     groups = index.shape[0] // 16
+    moving = row(moved, 0), node, motion
+    arrays = means, geometry, sh, sh_size
+    out = size, index, first_id, records, boxes, keys, ids
     for lane in range(16):
         lanes[NODE * 16 + lane] = node
     while True:
@@ -630,16 +517,4 @@ def project_lens_part(
         if begin >= groups:
             return
         for group in range(begin, min(begin + CHUNK, groups)):
-            chosen = _project_group(
-                group, means, geometry, sh, sh_size, pose, lens, moves, row(moved, 0), lanes
-            )
-            if chosen == 0:
-                continue
-            out = v.fetch_add(cursor, 0, _count(chosen))
-            while chosen != 0:
-                lane = v.lowest_bit(chosen)
-                chosen &= chosen - 1
-                _write_record(lanes, lane, lens, out, size, records, boxes)
-                keys[out] = lanes[KEY * 16 + lane]
-                ids[out] = index[group * 16 + lane] + first_id
-                out += 1
+            _project_group(cursor, group, arrays, pose, lens, moves, moving, lanes, out)

@@ -22,9 +22,16 @@ from alpasim_plugin.gaussians.constants import (
     R,
 )
 from alpasim_plugin.gaussians.raster import simd as v
-from alpasim_plugin.gaussians.raster.lens_project_kernels import (
-    CLOSE,
-    CUT_SIGMA,
+from alpasim_plugin.gaussians.raster.lens_rays import (
+    BLOCK_ROWS,
+    LENS_SHIFT,
+    LENS_TURN,
+    MOTION,
+    MOTION_CENTRE,
+    MOTION_SPEED,
+    MOTION_TURN,
+)
+from alpasim_plugin.gaussians.raster.lens_records import (
     DEPTH,
     DISTANCE,
     INVERSE_O2,
@@ -38,19 +45,15 @@ from alpasim_plugin.gaussians.raster.lens_project_kernels import (
     ROW_S,
     SHORT,
 )
-from alpasim_plugin.gaussians.raster.lens_rays import (
-    BLOCK_ROWS,
-    LENS_SHIFT,
-    LENS_TIME,
-    LENS_TURN,
-    MOTION,
-    MOTION_BOUND_D,
-    MOTION_BOUND_O,
-    MOTION_CENTRE,
-    MOTION_SPEED,
-    MOTION_TURN,
+from alpasim_plugin.gaussians.raster.lens_touch_kernels import (
+    SQUARES,
+    half_time,
+    roll_squares,
+    time_of,
+    touched,
+    turned,
 )
-from alpasim_plugin.gaussians.raster.project_kernels import cross, dot, load3, row
+from alpasim_plugin.gaussians.raster.project_kernels import dot, load3, row
 from alpasim_plugin.gaussians.raster.raster_kernels import (
     CHUNK,
     CUT,
@@ -62,38 +65,16 @@ from alpasim_plugin.gaussians.raster.raster_kernels import (
     STATE_T,
     block_centres,
     falloff,
+    touched_blocks,
+    whitened,
 )
 
 _f = np.float32
 Q2_SCALE = _f(EXPONENT_SCALE**2)
+INVERSE_SCALE = _f(1 / EXPONENT_SCALE**2)
 TINY = _f(1e-30)
 # Per block of a rolling shutter's tile: direction and time of sixteen pixels.
 ROLLED_D, ROLLED_TIME, ROLLED = 0, 48, 64
-# Per tile: mean, change to the right and down of directions, what they miss, and the blocks' times.
-MISSED_D, BLOCK_TIME, BLOCKS = 144, 160, 176
-HALF_BLOCK_PX = _f(1.5)
-ALL_BLOCKS = 0xFFFF
-ROUNDING = _f(1e-3)  # of standard deviations
-
-
-@kernel
-def _turned(d, turn, time):
-    """Return vectors turned by ``time turn``, to second order."""
-    first = cross(turn, d)
-    second = cross(turn, first)
-    half = _f(0.5) * time * time
-    return (
-        v.fma(half, second[0], v.fma(time, first[0], d[0])),
-        v.fma(half, second[1], v.fma(time, first[1], d[1])),
-        v.fma(half, second[2], v.fma(time, first[2], d[2])),
-    )
-
-
-@kernel
-def _time(lens, x, y):
-    """Return when pixels are exposed, in shutters from the middle."""
-    time = v.fma(x, lens[LENS_TIME], v.fma(y, lens[LENS_TIME + 1], lens[LENS_TIME + 2]))
-    return v.minimum(v.maximum(time, -0.5), 0.5)
 
 
 @kernel
@@ -106,129 +87,11 @@ def _store3(array, offset, a):
 @kernel
 def _roll_pixels(rays, place, x, y, lens, rolled, block):
     """Write direction and time of a block's pixels."""
-    time = _time(lens, x, y)
-    d = _turned(load3(rays, place), row(lens, LENS_TURN), time)
+    time = time_of(lens, x, y)
+    d = turned(load3(rays, place), row(lens, LENS_TURN), time)
     base = block * ROLLED
     _store3(rolled, base + ROLLED_D, d)
     v.store(rolled, base + ROLLED_TIME, time)
-
-
-@kernel
-def _roll_blocks(blocks, place, x0, y0, lens, out):
-    """Write how directions vary over a tile's blocks, and their times; ``x0, y0`` is the centre of
-    its first pixel.
-    """
-    turn = row(lens, LENS_TURN)
-    mean, right, down = load3(blocks, place), load3(blocks, place + 48), load3(blocks, place + 96)
-    x = v.lane_pattern(_f(4.0), _f(0.0)) + x0
-    y = v.lane_pattern(_f(0.0), _f(4.0)) + y0
-    zero = x * _f(0.0)
-    for k in range(9):
-        v.store(out, k * 16, zero)
-    quarter = _f(0.25)
-    for corner in range(4):
-        to_right = _f(2 * (corner & 1) - 1)
-        to_down = _f((corner & 2) - 1)
-        d = (
-            v.fma(right[0], to_right, v.fma(down[0], to_down, mean[0])),
-            v.fma(right[1], to_right, v.fma(down[1], to_down, mean[1])),
-            v.fma(right[2], to_right, v.fma(down[2], to_down, mean[2])),
-        )
-        time = _time(lens, x + (to_right + _f(1.0)) * _f(1.5), y + (to_down + _f(1.0)) * _f(1.5))
-        d = _turned(d, turn, time)
-        for k in range(3):
-            first = k * 16
-            v.store(out, first, v.fma(quarter, d[k], v.load(out, first)))
-            v.store(out, first + 48, v.fma(quarter * to_right, d[k], v.load(out, first + 48)))
-            v.store(out, first + 96, v.fma(quarter * to_down, d[k], v.load(out, first + 96)))
-    # What a product of the time's and the ray's change adds.
-    later = _f(2.0) * _half_block_time(lens)
-    turned = later * _f(np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2))
-    change = v.sqrt(dot(right, right)) + v.sqrt(dot(down, down))
-    v.store(out, MISSED_D, v.load(blocks, place + 144) + turned * (change + turned))
-    v.store(out, BLOCK_TIME, _time(lens, x + HALF_BLOCK_PX, y + HALF_BLOCK_PX))
-
-
-@kernel
-def _half_block_time(lens):
-    """Return by how much a pixel of a block is exposed before or after its middle, at most."""
-    return HALF_BLOCK_PX * _f(abs(lens[LENS_TIME]) + abs(lens[LENS_TIME + 1]))
-
-
-@kernel
-def _vary(records, place, blocks, offset):
-    """Return the mean of a row's products with the rays of each block, and its changes to the right
-    and down.
-    """
-    a = row(records, place)
-    return (
-        dot(a, load3(blocks, offset)),
-        dot(a, load3(blocks, offset + 48)),
-        dot(a, load3(blocks, offset + 96)),
-    )
-
-
-@kernel
-def _length(records, first, end):
-    total = _f(0.0)
-    for k in range(first, end):
-        total += records[k] * records[k]
-    return np.sqrt(total)
-
-
-@kernel
-def _touched(records, place, blocks, offset, motion, later):
-    """Return the bit mask of a tile's blocks that a Gaussian can touch."""
-    t2 = records[place + CUT_SIGMA] * records[place + CUT_SIGMA]
-    if records[place + INVERSE_O2] * t2 >= _f(CLOSE):
-        return ALL_BLOCKS
-    if motion is not None and records[place + PASSED] > 0:
-        return ALL_BLOCKS
-    a, a_right, a_down = _vary(records, place + ROW_A, blocks, offset)
-    b, b_right, b_down = _vary(records, place + ROW_B, blocks, offset)
-    c, c_right, c_down = _vary(records, place + ROW_C, blocks, offset)
-    size = np.sqrt(
-        _length(records, place + ROW_A, place + ROW_A + 6) ** 2
-        + _length(records, place + ROW_C, place + ROW_C + 3) ** 2
-    )
-    missed = v.load(blocks, offset + (MISSED_D if motion is not None else 144))
-    if motion is not None and records[place + NODE] >= 0:
-        node = np.int64(records[place + NODE]) * MOTION
-        missed = missed + motion[node + MOTION_BOUND_D]
-    extra = size * missed + ROUNDING
-    change_a = v.absolute(a_right) + v.absolute(a_down)
-    change_b = v.absolute(b_right) + v.absolute(b_down)
-    off_axis = v.sqrt(v.fma(a, a, b * b))
-    change = v.sqrt(v.fma(change_a, change_a, change_b * change_b)) + extra
-    most = off_axis + change
-    ahead = c + v.absolute(c_right) + v.absolute(c_down) + extra
-    if motion is not None:
-        s1, s2, s3 = row(records, place + ROW_S)
-        time = v.load(blocks, offset + BLOCK_TIME)
-        by_x = v.fma(s2, c, v.negative(s3 * b))
-        by_y = v.fma(s3, a, v.negative(s1 * c))
-        x = v.fma(time, by_x, b)
-        y = v.fma(time, by_y, v.negative(a))
-        off_axis = v.sqrt(v.fma(x, x, y * y))
-        x_right = v.fma(s2, c_right, v.negative(s3 * b_right))
-        x_down = v.fma(s2, c_down, v.negative(s3 * b_down))
-        y_right = v.fma(s3, a_right, v.negative(s1 * c_right))
-        y_down = v.fma(s3, a_down, v.negative(s1 * c_down))
-        change_x = v.absolute(v.fma(time, x_right, b_right))
-        change_x = change_x + v.absolute(v.fma(time, x_down, b_down))
-        change_x = change_x + later * (v.absolute(by_x) + v.absolute(x_right) + v.absolute(x_down))
-        change_y = v.absolute(v.fma(time, y_right, v.negative(a_right)))
-        change_y = change_y + v.absolute(v.fma(time, y_down, v.negative(a_down)))
-        change_y = change_y + later * (v.absolute(by_y) + v.absolute(y_right) + v.absolute(y_down))
-        sway = _f(1.0) + _f(0.5) * (abs(s1) + abs(s2) + abs(s3))
-        change = v.sqrt(v.fma(change_x, change_x, change_y * change_y)) + extra * sway
-        if records[place + NODE] >= 0:
-            node = np.int64(records[place + NODE]) * MOTION
-            off = size * motion[node + MOTION_BOUND_O] / records[place + DISTANCE]
-            change = change + off * (v.absolute(ahead) + most)
-    least = v.maximum(off_axis - change, _f(0.0))
-    below = v.fma(most * most, records[place + INVERSE_O2], ahead * ahead)
-    return v.bits((least * least <= _f(1.0001) * t2 * below) & (ahead > _f(0.0)))
 
 
 @kernel
@@ -245,9 +108,9 @@ def _as_if_still(motion, node, d, o, time):
         v.fma(back, speed[1], o[1] - centre[1]),
         v.fma(back, speed[2], o[2] - centre[2]),
     )
-    start = _turned(from_centre, turn, back)
+    start = turned(from_centre, turn, back)
     start = start[0] + centre[0], start[1] + centre[1], start[2] + centre[2]
-    return _turned(d, turn, back), start
+    return turned(d, turn, back), start
 
 
 @kernel
@@ -320,7 +183,7 @@ def _q2(near, place, d):
 
 
 @kernel
-def _blend_block(block, rays, at_rays, rolled, lens, motion, chunk):
+def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
     """Blend the splats of a chunk that touch a block; returns whether its pixels are finished.
 
     ``rolled`` is None of a global shutter, ``motion`` where all that is near moves evenly: a branch
@@ -349,7 +212,10 @@ def _blend_block(block, rays, at_rays, rolled, lens, motion, chunk):
         while touching != 0:
             place = (word * 64 + v.lowest_bit(touching)) * size
             touching &= touching - 1
-            if motion is not None:
+            if near[place + INVERSE_O2] < 0:
+                across, down = whitened(near, place, x, y)
+                q2 = v.fma(across, across, down * down) * INVERSE_SCALE
+            elif motion is not None:
                 q2 = _turned_q2(near, place, d, time, shift, motion)
             elif rolled is not None:
                 q2 = _even_q2(near, place, d, time)
@@ -399,14 +265,28 @@ def _start_tile(tile, alive, state):
 
 @kernel
 def _composite_tile(
-    lists, start, end, records, rays, at_rays, blocks, at_blocks, rolled, lens, motion, live, room
+    lists,
+    start,
+    end,
+    records,
+    rays,
+    at_rays,
+    blocks,
+    at_blocks,
+    rolled,
+    lens,
+    motion,
+    live,
+    corner,
+    room,
 ):
-    """Blend a tile's splats in order; ``room`` is the state, and that for a chunk of splats: their
-    records, and which blocks they touch.
+    """Blend a tile's splats in order. ``corner`` is the centre of its first pixel; ``room`` is the
+    state, and that for a chunk of splats: their records, and which blocks they touch.
     """
     state, near, masks = room
+    x0, y0 = corner
     size = LONG if motion is not None else SHORT
-    later = _half_block_time(lens)
+    later = half_time(lens, _f(3.0))
     for first in range(start, end, CHUNK):
         if live == 0:
             return
@@ -418,7 +298,11 @@ def _composite_tile(
             if motion is not None:
                 v.prefetch(records, later_place + 16)
             place = np.int64(lists[first + i]) * size
-            masks[i] = _touched(records, place, blocks, at_blocks, motion, later)
+            if records[place + INVERSE_O2] < 0:
+                masks[i] = touched_blocks(records, place, x0, y0)
+                v.store(near, i * size, v.load(records, place))
+                continue
+            masks[i] = touched(records, place, blocks, at_blocks, motion, later)
             if masks[i] & live:
                 v.store(near, i * size, v.load(records, place))
                 if motion is not None:
@@ -432,12 +316,13 @@ def _composite_tile(
             todo &= todo - 1
             place = at_rays + block * 48
             chunk = masks, near, size, state
+            x, y = block_centres(x0, y0, block)
             if motion is None:
-                finished = _blend_block(block, rays, place, None, lens, None, chunk)
+                finished = _blend_block(block, x, y, rays, place, None, lens, None, chunk)
             elif is_even:
-                finished = _blend_block(block, rays, place, rolled, lens, None, chunk)
+                finished = _blend_block(block, x, y, rays, place, rolled, lens, None, chunk)
             else:
-                finished = _blend_block(block, rays, place, rolled, lens, motion, chunk)
+                finished = _blend_block(block, x, y, rays, place, rolled, lens, motion, chunk)
             if finished:
                 live &= ~(1 << block)
 
@@ -500,7 +385,7 @@ def composite_lens_tiles(
     near = np.empty(CHUNK * (LONG if motion is not None else SHORT), dtype=np.float32)
     room = np.empty(16 * STATE, dtype=np.float32), near, np.empty(CHUNK, dtype=np.int32)
     rolled = np.empty(16 * ROLLED, dtype=np.float32)
-    rolled_blocks = np.empty(BLOCKS, dtype=np.float32)
+    rolled_blocks = np.empty(SQUARES, dtype=np.float32)
     while True:
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:
@@ -511,15 +396,17 @@ def composite_lens_tiles(
         at_rays = tile * 16 * 48
         at_blocks = tile * BLOCK_ROWS * 16
         span = lists, starts[tile], starts[tile + 1], records, rays, at_rays
+        x0 = _f(tile_x * TILE) + _f(0.5)
+        y0 = _f(tile_y * TILE) + _f(0.5)
         if motion is not None:
-            x0 = _f(tile_x * TILE) + _f(0.5)
-            y0 = _f(tile_y * TILE) + _f(0.5)
-            _roll_blocks(blocks, at_blocks, x0, y0, lens, rolled_blocks)
+            first_x = v.lane_pattern(_f(4.0), _f(0.0)) + x0
+            first_y = v.lane_pattern(_f(0.0), _f(4.0)) + y0
+            roll_squares(blocks, at_blocks, first_x, first_y, _f(3.0), lens, rolled_blocks, 0)
             for block in range(16):
                 x, y = block_centres(x0, y0, block)
                 _roll_pixels(rays, at_rays + block * 48, x, y, lens, rolled, block)
-            _composite_tile(*span, rolled_blocks, 0, rolled, lens, motion, live, room)
+            _composite_tile(*span, rolled_blocks, 0, rolled, lens, motion, live, (x0, y0), room)
         else:
-            _composite_tile(*span, blocks, at_blocks, rolled, lens, motion, live, room)
+            _composite_tile(*span, blocks, at_blocks, rolled, lens, motion, live, (x0, y0), room)
         at_alive = tile * 256
         _write_tile(tile_x, tile_y, room[0], alive, at_alive, behind, colour, alpha, depth)

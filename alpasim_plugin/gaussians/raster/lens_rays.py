@@ -8,8 +8,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import radial_form
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F32, F64, FloatArray
+from alpasim_plugin.core.types import F32, F64, CameraSpec, FloatArray
 from alpasim_plugin.gaussians.camera import Rolling
 from alpasim_plugin.gaussians.constants import TILE
 from alpasim_plugin.gaussians.lens_camera import (
@@ -31,16 +32,21 @@ LENS_MARGIN = 9  # pixels by which every box is grown
 LENS_LINEAR = 10
 LENS_BENDS = 14  # whether there are tangential terms: the six after it
 LENS_ROLLS = 21
+LENS_SMALL = 31  # by how much an ellipse may miss a small Gaussian: see `lens_small_kernels`
 LENS_TIME = 22  # of a pixel: a, b, c of `Rolling.time`
 LENS_TURN = 25  # the camera's own motion in a shutter, in its axes at the middle
 LENS_SHIFT = 28
 LENS_G = 32
+LENS_BEND = 47  # of a lens's image, radians a radian
 LENS_SLOPE = 48
 LENS_SIZE = 64
-# A block of pixels: their rays' mean, its change to the right and down, and what these two miss.
+# A square of pixels: their rays' mean, its change to the right and down, and what these two miss.
 BLOCK_ROWS = 10
-STEPS = np.linspace(-1, 1, 4, dtype=np.float32)
 MARGIN_PX = 0.02
+# By how much an ellipse of the image may miss a Gaussian, see `lens_small_kernels.is_small`: a level of
+# 255. Where the form of a lens misses it by more than so many pixels, no ellipses are drawn.
+MISSED = 1 / (255 * 1.16)
+EXACT_PX = 5e-3
 # How a moving node differs from the standing world: rotation vector, velocity and centre, by the
 # shutter, then how much its turning changes a ray's direction and start at most.
 MOTION_TURN, MOTION_SPEED, MOTION_CENTRE, MOTION_BOUND_D, MOTION_BOUND_O = 0, 3, 6, 9, 10
@@ -55,13 +61,15 @@ class TileRays:
     Attributes:
         rays: float32, 3 x 16 numbers a block.
         alive: float32, 16 numbers a block: 1 where the lens sees anything, else -1.
-        blocks: float32, `BLOCK_ROWS` x 16 numbers a tile.
+        blocks: float32, `BLOCK_ROWS` x 16 numbers a tile: of its sixteen blocks.
+        tiles: float32, as many for each sixteen tiles side by side: of these tiles.
         lens: float64 ``(LENS_SIZE,)`` of a global shutter.
     """
 
     rays: F32
     alive: F32
     blocks: F32
+    tiles: F32
     lens: F64
 
 
@@ -90,27 +98,39 @@ def _tile_rays(key: LensKey) -> TileRays:
         np.ascontiguousarray(
             alive.reshape(rows, 4, 4, columns, 4, 4).transpose(0, 3, 1, 4, 2, 5)
         ).reshape(-1),
-        _block_table(blocked),
+        _square_table(blocked),
+        _tile_table(rays),
         _lens_numbers(key),
     )
 
 
-def _block_table(rays: F32) -> F32:
-    """Return by tile the bilinear part of the rays ``(tiles, 16, 4, 4, 3)`` of each block: mean,
+def _square_table(rays: F32) -> F32:
+    """Return by sixteen squares ``(N, 16, side, side, 3)`` the bilinear part of their rays: mean,
     change to the right, change down, each x, y, z, and the greatest distance from it.
     """
-    corners = rays[:, :, ::3, ::3]
+    side = rays.shape[2]
+    steps = np.linspace(-1, 1, side, dtype=np.float32)
+    corners = rays[:, :, :: side - 1, :: side - 1]
     mean = corners.mean(axis=(2, 3))
     right = (corners[:, :, :, 1] - corners[:, :, :, 0]).mean(axis=2) / 2
     down = (corners[:, :, 1] - corners[:, :, 0]).mean(axis=2) / 2
     flat = (
         mean[:, :, None, None]
-        + STEPS[None, None, None, :, None] * right[:, :, None, None]
-        + STEPS[None, None, :, None, None] * down[:, :, None, None]
+        + steps[None, None, None, :, None] * right[:, :, None, None]
+        + steps[None, None, :, None, None] * down[:, :, None, None]
     )
     missed = np.sqrt(((rays - flat) ** 2).sum(axis=-1)).max(axis=(2, 3))
     parts = [*(part.transpose(0, 2, 1) for part in (mean, right, down)), missed[:, None]]
     return np.ascontiguousarray(np.concatenate(parts, axis=1), dtype=np.float32).reshape(-1)
+
+
+def _tile_table(rays: F32) -> F32:
+    """Return `_square_table` of the tiles of rays ``(H, W, 3)``, those of a row sixteen by sixteen."""
+    rows = rays.shape[0] // TILE
+    columns = rays.shape[1] // TILE
+    tiles = rays.reshape(rows, TILE, columns, TILE, 3).transpose(0, 2, 1, 3, 4)
+    tiles = np.pad(tiles, ((0, 0), (0, -columns % 16), (0, 0), (0, 0), (0, 0)), mode="edge")
+    return _square_table(tiles.reshape(-1, 16, TILE, TILE, 3))
 
 
 def _lens_numbers(key: LensKey) -> F64:
@@ -122,8 +142,10 @@ def _lens_numbers(key: LensKey) -> F64:
     numbers[LENS_COS], numbers[LENS_SIN] = np.cos(mapped.widest_rad), np.sin(mapped.widest_rad)
     numbers[LENS_S_MOST] = mapped.s_most
     numbers[LENS_LEAST], numbers[LENS_MOST] = mapped.px_per_rad
+    numbers[LENS_SMALL] = MISSED if mapped.error_px <= EXACT_PX else 0.0
     numbers[LENS_MARGIN] = MARGIN_PX + mapped.error_px
     numbers[LENS_LINEAR : LENS_LINEAR + 4] = mapped.linear.ravel()
+    numbers[LENS_BEND] = _bend(spec, mapped.widest_rad)
     numbers[LENS_BENDS] = any(mapped.bent)
     numbers[LENS_BENDS + 1 : LENS_BENDS + 7] = mapped.bent
     polynomial = mapped.polynomial
@@ -131,6 +153,33 @@ def _lens_numbers(key: LensKey) -> F64:
     numbers[LENS_G : LENS_G + len(polynomial)] = polynomial
     numbers[LENS_SLOPE : LENS_SLOPE + len(slope)] = slope
     return numbers
+
+
+def _bend(spec: CameraSpec, widest_rad: float) -> float:
+    """Return by how much a step of one radian across the line of sight is shown beside where the
+    slopes of the lens put it, radians: half of its second derivative, the largest in the image.
+    """
+    form = radial_form(spec)
+    angle = np.linspace(0.02, widest_rad, 32)[:, None]
+    turn = np.linspace(0, np.pi, 8, endpoint=False)
+    step = 0.01
+
+    def shown(x: F64, y: F64) -> F64:
+        """Return where the lens shows directions beside those at the angles, without its scale."""
+        ray_x = np.sin(angle) + x * np.cos(angle)
+        ray_z = np.cos(angle) - x * np.sin(angle)
+        across = np.hypot(ray_x, y)
+        polar = np.arctan2(across, ray_z)
+        radius = form.radius(polar.ravel()).reshape(polar.shape) / across
+        return np.stack([ray_x * radius, np.broadcast_to(y * radius, radius.shape)], axis=-1)
+
+    zero = np.zeros(1)
+    x, y = step * np.cos(turn), step * np.sin(turn)
+    bend = (shown(x, y) + shown(-x, -y)) / 2 - shown(zero, zero)
+    slope_x = (shown(zero + step, zero) - shown(zero - step, zero))[..., 0] / (2 * step)
+    slope_y = (shown(zero, zero + step) - shown(zero, zero - step))[..., 1] / (2 * step)
+    off = np.hypot(bend[..., 0] / slope_x, bend[..., 1] / slope_y)
+    return float(off.max() / step**2)
 
 
 def camera_lens(camera: LensCamera) -> F64:

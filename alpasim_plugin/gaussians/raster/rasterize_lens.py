@@ -1,5 +1,6 @@
 """Render through lenses and rolling shutters on the CPU, each Gaussian evaluated along each pixel's
-ray; the stages are those of `rasterize_cpu`.
+ray. Small ones are drawn as ellipses of the image, which miss them by a level of 255 at most. The
+stages are those of `rasterize_cpu`.
 
 One order of drawing for the whole frame, by the largest of |x|, |y| and |z| of each mean in the
 camera's axes: it equals z in a pinhole of up to 90 degrees, is continuous, and nothing pops between
@@ -9,27 +10,33 @@ tiles.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from alpasim_plugin.core.types import F32, F64
-from alpasim_plugin.gaussians.constants import POSE_ANTIALIAS, POSE_SHIFT, POSE_TURN
+from alpasim_plugin.core.types import F32, F64, I64
+from alpasim_plugin.gaussians.constants import POSE_ANTIALIAS, POSE_SHIFT, POSE_TURN, TILE
 from alpasim_plugin.gaussians.lens_camera import LensCamera
-from alpasim_plugin.gaussians.raster.lens_project_kernels import LONG, SHORT, project_lens_part
+from alpasim_plugin.gaussians.raster.lens_project_kernels import project_lens_part
 from alpasim_plugin.gaussians.raster.lens_raster_kernels import composite_lens_tiles
 from alpasim_plugin.gaussians.raster.lens_rays import (
     LENS_SHIFT,
     MOTION,
     MOTION_SPEED,
     MOTION_TURN,
+    TileRays,
     camera_lens,
     node_motion,
     tile_rays,
 )
+from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2, LONG, SHORT
+from alpasim_plugin.gaussians.raster.lens_touch_kernels import SQUARES, roll_tiles, split_wide
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
 from alpasim_plugin.gaussians.raster.prepared import Node
 from alpasim_plugin.gaussians.raster.stages import (
     WORTH_THREADS,
+    TileLists,
     depth_order,
     list_boxes,
     node_poses,
@@ -37,6 +44,7 @@ from alpasim_plugin.gaussians.raster.stages import (
     write_motion,
 )
 
+WIDE_TILES = 40  # in a larger box the tiles are looked for that a splat touches
 STRAIGHT_RAD = 1e-5  # a road user that turns less in a shutter moves along a line
 
 
@@ -67,9 +75,10 @@ def rasterize_lens(
     boxes = np.empty((room, 4), dtype=np.int16)
     keys = np.empty(room, dtype=np.float32)
     ids = np.empty(room, dtype=np.int64)
+    motions = np.zeros(MOTION, dtype=np.float32) if motion is None else motion
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts = [
-        (*prepared.arrays(), end - prepared.n_input, pose, number, shift, lens, size)
+        (*prepared.arrays(), end - prepared.n_input, pose, number, shift, motions, lens, size)
         for (prepared, _), end, pose, number, shift in zip(
             nodes, ends, poses, numbers, moved, strict=True
         )
@@ -82,8 +91,8 @@ def rasterize_lens(
 
     run_on_threads(threads if room > WORTH_THREADS else 1, project)
     count = int(cursor[0])
-    order = depth_order(keys[:count], ids[:count])
-    tiles = list_boxes(order, boxes[:count], camera.width, camera.height, threads)
+    splats = DrawnSplats(records, size, boxes[:count], keys[:count], ids[:count])
+    tiles = _listed(splats, camera, table_of_rays, lens, motion, threads)
     shape = (camera.height, camera.width)
     colour = np.empty((*shape, 3), dtype=np.float32)
     alpha = np.empty(shape, dtype=np.float32)
@@ -94,6 +103,66 @@ def rasterize_lens(
         threads, composite_lens_tiles, *lists, *rays, motion, behind, colour, alpha, depth
     )
     return RasterOutput(colour, alpha, depth)
+
+
+class DrawnSplats(NamedTuple):
+    """The splats that reach an image: see `lens_project_kernels.project_lens_part`."""
+
+    records: F32
+    size: int
+    boxes: npt.NDArray[np.int16]
+    keys: F32
+    ids: I64
+
+
+def _listed(
+    splats: DrawnSplats,
+    camera: LensCamera,
+    table: TileRays,
+    lens: F64,
+    motion: F32 | None,
+    threads: int,
+) -> TileLists:
+    """Return the lists of the tiles; wide splats are in those alone that they touch."""
+    boxes = splats.boxes
+    count = len(boxes)
+    tiles_x = -(-camera.width // TILE)
+    tiles_y = -(-camera.height // TILE)
+    sides = boxes[:, 1::2] - boxes[:, ::2]
+    wide = np.flatnonzero(sides[:, 0].astype(np.int32) * sides[:, 1] > WIDE_TILES)
+    wide = wide[splats.records[wide * splats.size + INVERSE_O2] >= 0]
+    room = int(sides[wide, 1].sum())
+    owners = np.empty(room, dtype=np.int64)
+    spans = np.empty((room, 4), dtype=np.int16)
+    tile_table = table.tiles
+    if motion is not None:
+        groups = -(-tiles_x // 16)
+        tile_table = np.empty(tiles_y * groups * SQUARES, dtype=np.float32)
+        roll_tiles(table.tiles, tiles_x, tiles_y, lens, tile_table)
+    cursor = np.zeros(2, dtype=np.int64)
+    run_on_threads(
+        threads if len(wide) > 64 else 1,
+        split_wide,
+        cursor,
+        wide,
+        splats.records,
+        splats.size,
+        tile_table,
+        lens,
+        motion,
+        boxes,
+        owners,
+        spans,
+        tiles_x,
+    )
+    written = int(cursor[1])
+    owners = owners[:written]
+    keys = np.concatenate([splats.keys, splats.keys[owners]])
+    ids = np.concatenate([splats.ids, splats.ids[owners]])
+    boxes = np.concatenate([boxes, spans[:written]])
+    owners = np.concatenate([np.arange(count), owners])
+    order = depth_order(keys, ids)
+    return list_boxes(order, boxes, camera.width, camera.height, threads, owners)
 
 
 def _motions(

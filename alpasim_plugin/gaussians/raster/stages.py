@@ -118,7 +118,12 @@ class TileLists:
 
 
 def list_boxes(
-    order: I64, by_record: npt.NDArray[np.int16], width: int, height: int, threads: int
+    order: I64,
+    by_record: npt.NDArray[np.int16],
+    width: int,
+    height: int,
+    threads: int,
+    owners: I64 | None = None,
 ) -> TileLists:
     """List projected records per tile.
 
@@ -127,6 +132,7 @@ def list_boxes(
         by_record: ``(N, 4)``, see `binning.tile_boxes`.
         width, height: Pixels of the image.
         threads: How many threads to use.
+        owners: ``(N,)``, the record of each box; None: a box is that of the record with its number.
     """
     count = len(order)
     tiles_x = -(-width // TILE)
@@ -144,7 +150,8 @@ def list_boxes(
     before = np.cumsum(counts, axis=0) - counts
     lists = np.empty(starts[-1], dtype=np.int32)
     cursor[:] = 0
-    chunks = (cursor, chunk_size, order, boxes)
+    splats = order if owners is None else owners[order]
+    chunks = (cursor, chunk_size, splats, boxes)
     run_on_threads(workers, fill_tiles, *chunks, tiles_x, starts[:-1] + before, lists)
     return TileLists(tiles_x, starts, lists)
 
