@@ -45,7 +45,8 @@ def test_twenty_clips_have_the_distances_of_the_reference(name):
     net = seed_network(NETWORKS[name](), trained_keys)
     truth, made = (np.concatenate(side) for side in zip(*map(clip, range(CLIPS)), strict=True))
     values = image_distances(net, made, truth).reshape(CLIPS, -1).mean(axis=1)
-    assert values == pytest.approx(golden(name)["values"], rel=CLOSE)
+    # DISTS is one minus a sum near one, in float32.
+    assert values == pytest.approx(golden(name)["values"], rel=CLOSE, abs=1e-6)
 
 
 def test_dists_is_zero_for_equal_images_and_symmetric():
