@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from pages import table
 
-from alpasim_plugin.core.files import read_json_as
+from alpasim_plugin.core.files import file_sha256, read_json_as
 from alpasim_plugin.core.files.atomic import write_json
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, resolve, resolve_renderer
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.lab.bench.colour_video_vdp import load_metric
 from alpasim_plugin.lab.bench.open_and_closed import TRUTH, correlation_rows, measure_scene
 from alpasim_plugin.lab.bench.real import Judges
@@ -52,10 +53,13 @@ def measured(
 ) -> list[dict[str, Any]]:
     """Return the rows of a scene, from its file in ``out`` where that was measured alike."""
     record = out / f"{file.parent.name}-{file.stem}.json"
+    settings = {**settings, "scene": file_sha256(file), "program": package_digest()}
     if record.exists():
         stored: dict[str, Any] = read_json_as(dict[str, Any], record)
         if stored["settings"] != settings:
-            raise SystemExit(f"{record}: measured with other settings; name another folder")
+            raise SystemExit(
+                f"{record}: measured with other settings, of another scene or by another program; name another folder"
+            )
         rows: list[dict[str, Any]] = stored["rows"]
         return rows
     scenario = load_scenario(file)

@@ -18,6 +18,7 @@ from evaluators.statistics.intervals import LEVEL, Interval
 LEAST_GROUPS = 6
 PERFECT = 1 - 1e-12  # from here on a coefficient is 1 but for rounding
 FEW = "needs at least {} groups, found {}"
+FEW_CHANGED = "one side has two values, and the rarer stands in {} groups; at least {} are needed"
 DEPENDS = "without one group all values of one side are equal, or the order is perfect"
 
 Coefficient = Callable[[Sequence[int]], float | None]
@@ -45,7 +46,8 @@ def spearman(x: F64, y: F64) -> float | None:
 def group_spearman(x: F64, y: F64, groups: Sequence[str]) -> Interval | None:
     """Return Spearman's coefficient of all units with its 95 % interval by groups; None where all
     values of one side are equal. Bounds are None, with a reason, below six groups, where the order
-    is perfect, or where one group alone makes the values differ.
+    is perfect, where one group alone makes the values differ, or where a side has two values and the
+    rarer stands in fewer than six groups: there the jackknife is too narrow.
 
     Args:
         x: ``(N,)``.
@@ -59,7 +61,9 @@ def group_spearman(x: F64, y: F64, groups: Sequence[str]) -> Interval | None:
     centre = coefficient(range(len(x)))
     if centre is None:
         return None
-    interval = _jackknife(coefficient, groups, _fisher)
+    interval = (
+        _too_few(y, groups) or _too_few(x, groups) or _jackknife(coefficient, groups, _fisher)
+    )
     if isinstance(interval, str):
         return Interval(centre, reason=interval)
     low, high = (math.tanh(bound) for bound in interval)
@@ -85,11 +89,23 @@ def group_difference(x: F64, other: F64, y: F64, groups: Sequence[str]) -> Inter
     centre = difference(range(len(x)))
     if centre is None:
         return None
-    interval = _jackknife(difference, groups, lambda value: value)
+    interval = _too_few(y, groups) or _jackknife(difference, groups, lambda value: value)
     if isinstance(interval, str):
         return Interval(centre, reason=interval)
     low, high = interval
     return Interval(centre, max(low, -2.0), min(high, 2.0), method="jackknife of groups")
+
+
+def _too_few(values: F64, groups: Sequence[str]) -> str | None:
+    """Return why values of two kinds give no interval; None where they give one."""
+    kinds, counts = np.unique(values, return_counts=True)
+    if len(kinds) != 2:
+        return None
+    is_rarer = values == kinds[np.argmin(counts)]
+    rare_groups = {group for group, is_rare in zip(groups, is_rarer, strict=True) if is_rare}
+    if len(rare_groups) >= LEAST_GROUPS:
+        return None
+    return FEW_CHANGED.format(len(rare_groups), LEAST_GROUPS)
 
 
 def _fisher(coefficient: float) -> float | None:

@@ -82,7 +82,7 @@ def test_a_nearly_perfect_order_has_an_interval_below_one():
 def test_one_group_that_alone_differs_has_no_interval():
     x = np.arange(14.0)
     y = np.zeros(14)
-    y[13] = 1.0
+    y[12:] = 1.0, 2.0
     interval = group_spearman(x, y, [f"g{number // 2}" for number in range(14)])
     assert interval.bounds is None
     assert "one group" in interval.reason
@@ -138,3 +138,14 @@ def test_a_difference_is_seen_where_there_is_one_and_covers_zero_where_there_is_
     assert (same.centre, same.low, same.high) == (0.0, 0.0, 0.0)
     intervals = [group_difference(*rng.normal(size=(2, len(x))), y, groups) for _ in range(40)]
     assert np.mean([interval.low <= 0.0 <= interval.high for interval in intervals]) >= 0.85
+
+
+@pytest.mark.parametrize(("changed", "is_bounded"), [(2, False), (5, False), (6, True)])
+def test_two_values_have_an_interval_where_six_groups_hold_the_rarer(changed, is_bounded):
+    rng = np.random.default_rng(changed)
+    x = rng.normal(size=60)
+    groups = [f"g{number // 3}" for number in range(60)]
+    y = np.repeat(np.arange(20) < changed, 3).astype(float)
+    for interval in (group_spearman(x, y, groups), group_difference(x, -x, y, groups)):
+        assert (interval.low is not None) == is_bounded
+        assert is_bounded or f"stands in {changed} groups" in interval.reason

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import file_sha256
+from alpasim_plugin.core.parts import resolve
 from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.lab.bench.quality import VERSION, metric_digests
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig, SceneSet, system_of
@@ -298,6 +299,7 @@ def _drives(config: PaperConfig, effort: Effort, kept: Path | None) -> list[Stag
         (*sets, *dict.fromkeys(name for network in networks.values() for name in network.reads)),
         {
             "program": package_digest(),  # a run reuses no rollout of another program either
+            "policy": resolve("policy", drive.policy).digest,
             "weights": {row: dict(network.digests) for row, network in networks.items()},
         },
         ("--workers", str(effort.jobs), "--device", effort.device),

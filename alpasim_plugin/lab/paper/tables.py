@@ -97,6 +97,8 @@ def _ours(cell: JsonObject, facts: PrintedMetric) -> str:
         return "none" if "vectors" in cell["about"] else "-"
     fact = FACTS.get(cell["metric"])
     digits = 1 if fact is None else fact.digits
+    if facts.scale < 1.0:
+        digits += 1
     if "half_width" in cell:
         half = cell["half_width"]
         text = f"{value * facts.scale:.2f}"

@@ -8,6 +8,7 @@ from scipy import stats
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
+from alpasim_plugin.lab.paper import tables
 from alpasim_plugin.lab.paper.claims import (
     Claim,
     Design,
@@ -175,3 +176,11 @@ def test_what_stands_in_place_of_the_papers_metrics_can_be_computed():
     ] == []
     for table in printed().tables.values():
         assert set(table.metrics) <= set(printed().metrics)
+
+
+@pytest.mark.parametrize(
+    ("metric", "value", "text"), [("fvd", 5830.0, "5.83"), ("fvmd", 674.0, "67.4")]
+)
+def test_distances_of_sets_are_printed_in_the_papers_scale(metric, value, text):
+    cell = {"value": value, "metric": metric, "interval": None, "about": {}}
+    assert tables._ours(cell, printed().metrics[metric]).startswith(text)
