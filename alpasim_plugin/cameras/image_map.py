@@ -19,7 +19,7 @@ DEGREE = 9
 NODES = 64
 BEYOND_RAD = np.deg2rad(20.0)
 FARTHEST_RAD = np.deg2rad(130.0)
-BELOW_TURN = 0.9  # of the angle at which a lens turns back, where its radius still grows
+BELOW_TURN = 0.9  # of the angle at which a lens turns back; an image may reach beyond it
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,8 @@ def image_map(camera: CameraSpec) -> ImageMap:
     """
     form = radial_form(camera)
     widest = rays_of(camera).widest_rad
-    limit = min(widest + BEYOND_RAD, FARTHEST_RAD, BELOW_TURN * form.grows_to_rad)
+    turns_rad = max(BELOW_TURN * form.grows_to_rad, min(widest, form.grows_to_rad))
+    limit = min(widest + BEYOND_RAD, FARTHEST_RAD, turns_rad)
     s_most = float(np.tan(limit / 2) ** 2)
     nodes = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     s = (nodes + 1) / 2 * s_most

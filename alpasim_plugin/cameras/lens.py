@@ -534,7 +534,9 @@ def exposed_bands(request: RenderRequest) -> list[Band]:
         return bands(request)
     u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
     rays = rays_at(camera, np.column_stack([u.ravel(), v.ravel()]))
-    sight = unit(rays.ray[rays.visible])
+    # The image of a lens that sees less than the distance of these pixels lies about its axis.
+    is_any = rays.visible.any()
+    sight = unit(rays.ray[rays.visible]) if is_any else np.array([[0.0, 0.0, 1.0]])
     return bands(request, largest_motion_px(request, sight, max(rays.focal)))
 
 

@@ -220,8 +220,9 @@ def largest_motion_px(request: RenderRequest, rays: F64, px_per_rad: float) -> f
             transform_points(inverse(T), points) for T, points in ((start, first), (end, last))
         )
         near_m = np.maximum(np.linalg.norm(after, axis=1) - USER_M, NEAR_M)
-        in_front = after[:, 2] > -USER_M
-        moves.append(np.where(in_front, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
+        # A lens may see what lies behind it.
+        is_seen = (after[:, 2] > -USER_M) | (request.camera.lens is not None)
+        moves.append(np.where(is_seen, np.linalg.norm(after - before, axis=1) / near_m, 0.0))
     return float(px_per_rad * max(float(np.max(move)) for move in moves))
 
 

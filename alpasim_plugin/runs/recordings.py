@@ -329,12 +329,13 @@ def _camera_items(camera: Source, log: RolloutLog, label: str) -> Iterator[Item]
 
 def _distortion(lens: LensModel | None) -> Message | None:
     """Return the model of a lens by its name in `foxglove.CameraCalibration`; None where none of
-    them states it: an f-theta lens, and one with thin prism terms.
+    them states it: an f-theta lens, a fisheye with more than four terms, and one with thin prism
+    terms.
     """
     if lens is None:
         return {"distortion_model": "", "D": []}
     terms = [*lens.coefficients, *[0.0] * (12 - len(lens.coefficients))]
-    if lens.kind == "fisheye":
+    if lens.kind == "fisheye" and not any(terms[4:]):
         return {"distortion_model": "kannala_brandt", "D": terms[:4]}
     if lens.kind == "opencv" and not any(terms[8:]):
         return {"distortion_model": "rational_polynomial", "D": terms[:8]}

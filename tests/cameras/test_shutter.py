@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from alpasim_plugin.cameras.image_map import image_map
+from alpasim_plugin.cameras.lens import exposed_bands
 from alpasim_plugin.cameras.shutter import (
     MOST_BANDS,
     at_share,
@@ -19,7 +21,7 @@ from alpasim_plugin.cameras.shutter import (
     rolling_exposure,
 )
 from alpasim_plugin.core.geometry import se2
-from alpasim_plugin.core.types import CameraSpec, Exposure, RenderRequest
+from alpasim_plugin.core.types import CameraSpec, Exposure, LensModel, RenderRequest
 from tests.camera_builders import ahead
 
 WIDTH = 64
@@ -136,3 +138,35 @@ def test_road_users_stand_at_the_shutters_start_where_they_were_then():
     assert_allclose(exposure.actors_start["newcomer"], now["newcomer"], atol=1e-9)
     assert exposure.share[0, 0] < exposure.share[-1, 0]
     assert rolling_exposure(SPEC, before, now, 100_000) is None
+
+
+def through_fisheye(max_angle_deg, focal_px, middle):
+    K = np.array([[focal_px, 0, middle[0]], [0, focal_px, middle[1]], [0, 0, 1]])
+    lens = LensModel("fisheye", max_angle_rad=np.deg2rad(max_angle_deg))
+    return CameraSpec("wide", 160, 120, K, FORWARD, 30_000, lens)
+
+
+def test_a_lens_sees_a_road_user_that_passes_behind_its_camera():
+    behind = np.deg2rad(112)
+    place = 10 * np.array([np.cos(behind), np.sin(behind)])
+    start, end = se2(place[0], place[1], 0), se2(place[0] + 0.6, place[1], 0)
+    request = asked(np.eye(4), np.eye(4), {"car": (start, end)})
+    camera = through_fisheye(115, 40.0, (80, 60))
+    exposure = replace(request.exposure, share=rolling(160, 120, "rows", False))
+    request = replace(request, camera=replace(camera, T_rig_camera=FORWARD), exposure=exposure)
+    assert len(exposed_bands(request)) > 1
+
+
+def test_a_lens_with_a_narrow_circle_between_the_places_looked_at_is_cut_into_bands():
+    request = asked(np.eye(4), se2(0.5, 0, 0.1))
+    exposure = replace(request.exposure, share=rolling(160, 120, "rows", False))
+    camera = through_fisheye(8, 47.0, (70, 52))
+    assert len(exposed_bands(replace(request, camera=camera, exposure=exposure))) > 1
+
+
+def test_the_form_of_a_lens_that_turns_back_near_its_edge_reaches_over_its_image():
+    lens = LensModel("ftheta", (0.0, 52.0, 0.0, -6.3), max_angle_rad=np.deg2rad(94))
+    K = np.array([[1.0, 0, 80], [0, 1, 60], [0, 0, 1]])
+    camera = CameraSpec("wide", 160, 120, K, FORWARD, 0, lens)
+    shown = image_map(camera)
+    assert 2 * np.arctan(np.sqrt(shown.s_most)) >= shown.widest_rad

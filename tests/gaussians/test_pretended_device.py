@@ -153,7 +153,9 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
     with pretended_device(monkeypatch):
         found = fixed("cuda:0")
         assert sum(traffic.waits.values()) == (1 if capacity > 10 else 2)
-        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= 2  # of images that differ by 1
+        # Images differ by 1; through a lens a device puts its map together of pinholes.
+        most = 2 if lens is None else 4
+        assert np.abs(found.rgb.astype(int) - wanted.rgb).max() <= most
         assert found.facts[RECORDED_SHARE] == pytest.approx(wanted.facts[RECORDED_SHARE], abs=1e-3)
         assert found.facts[OPACITY_MEAN] == pytest.approx(wanted.alpha.mean(), abs=1e-4)
         if capacity > 10:

@@ -15,6 +15,7 @@ from alpasim_plugin.gaussians import (
 )
 from alpasim_plugin.gaussians.camera import Rolling
 from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster import rasterize_lens
 from alpasim_plugin.gaussians.raster.lens_rays import (
     LENS_BEND,
     LENS_LEAST,
@@ -253,6 +254,19 @@ def test_small_gaussians_in_a_pinhole_are_those_of_the_affine_map():
     along_rays = rasterize(world, LensCamera(plain, inverse(WORLD)))
     assert np.abs(flat.rgb - along_rays.rgb).max() < 3 / 255
     assert flat.alpha.max() > 0.2
+
+
+@pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])
+def test_wide_gaussians_are_listed_in_all_tiles_that_they_touch(rolls, monkeypatch):
+    """Many tiles, and large Gaussians near the camera: the image is that of whole boxes."""
+    seen = fine_camera("fisheye", rolls)
+    world = cloud_of(around(60, 30, 0.5, 6), (1.5, 0.4, 0.05), 0.6, 31)
+    images = []
+    for wide_tiles in (0, 10**9):
+        monkeypatch.setattr(rasterize_lens, "WIDE_TILES", wide_tiles)
+        images.append(rasterize_prepared([(prepare(world), None)], seen, threads=2).rgb)
+    np.testing.assert_array_equal(images[0], images[1])
+    assert images[0].max() > 0.1
 
 
 def test_the_image_does_not_depend_on_the_threads():

@@ -149,6 +149,7 @@ def test_what_is_recorded_is_what_the_log_holds(watched, recorded, renderer):
             ("rational_polynomial", [-0.3, 0.1, 0.01, 0.02, 0.05, 0, 0, 0]),
         ),
         (LensModel("fisheye", (0.1, 0.2)), ("kannala_brandt", [0.1, 0.2, 0, 0])),
+        (LensModel("fisheye", (0.1, 0.2, 0.3, 0.4, 0.5)), None),
         (LensModel("opencv", (0.1, *[0.0] * 7, 0.1)), None),
         (LensModel("ftheta", (0.0, 90.0)), None),
     ],
