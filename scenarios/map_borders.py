@@ -9,6 +9,7 @@ each has one height and none lies above itself.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from alpasim_plugin.world.route import LEVEL_M
 SEAM_M = 0.1  # neighbouring areas drawn with gaps up to this wide are one surface
 MIN_HOLE_M2 = 0.5  # smaller holes are seams too
 STEP_M = 2.0  # AlpaSim's loaders keep the vertices of edges at most this far apart
+SLOPE = 0.2  # areas on one slope may differ in height by so much a metre of their distance
 CLIMB_M = 1.0  # a piece of a lane climbs no more
 
 
@@ -108,8 +110,8 @@ def _level_borders(
     if np.ptp(np.concatenate(points)[:, 2]) <= LEVEL_M:
         return None
     shapes = np.array([shapely.make_valid(area) for area in areas], dtype=object)
-    pairs, apart_m = touching_pairs(shapes, outlines, SEAM_M)
-    is_apart = apart_m > LEVEL_M
+    pairs, apart_m, away_m = touching_pairs(shapes, outlines, SEAM_M)
+    is_apart = apart_m > LEVEL_M + SLOPE * away_m
     if not is_apart.any():
         return None
     sheet = _sheets(len(shapes), pairs, is_apart)
@@ -155,8 +157,9 @@ def _sheets(count: int, pairs: I64, is_apart: Bool) -> I64:
                 continue
             taken = {int(sheet[other]) for other in stacked[area]}
             joined = [int(sheet[other]) for other in neighbours[area] if sheet[other] >= 0]
-            free = [number for number in (*sorted(joined), *range(count)) if number not in taken]
-            sheet[area] = free[0]
+            sheet[area] = next(
+                number for number in chain(sorted(joined), range(count)) if number not in taken
+            )
             queue += neighbours[area]
     return sheet
 

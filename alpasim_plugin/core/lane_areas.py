@@ -13,6 +13,7 @@ from alpasim_plugin.core.types import F64, I64, Lane
 
 HALF_WIDTH_M = 1.85
 WORLD_ORIGIN = np.zeros(3)
+PASSAGE_M = 1.0  # passages of a line at distances that differ by less are equally near
 
 
 def lane_polygon(
@@ -81,9 +82,10 @@ def areal_parts(shape: Any) -> Any:
     return parts[0] if len(parts) == 1 else shapely.union_all(parts)
 
 
-def touching_pairs(areas: Any, outlines: Sequence[F64], reach_m: float) -> tuple[I64, F64]:
+def touching_pairs(areas: Any, outlines: Sequence[F64], reach_m: float) -> tuple[I64, F64, F64]:
     """Return the pairs of areas that share a place, or come nearer to each other than twice a
-    distance, and how far they are apart in height there.
+    distance, how far they are apart in height there, and how far that place is from their outlines:
+    on a slope two areas at one height differ by as much as it rises over that distance.
 
     Args:
         areas: ``(B,)`` plan-view polygons.
@@ -92,7 +94,8 @@ def touching_pairs(areas: Any, outlines: Sequence[F64], reach_m: float) -> tuple
         reach_m: Distance by which areas are widened.
 
     Returns:
-        Rows ``(P, 2)`` of areas, the lower number first, and differences of height ``(P,)``, metres.
+        Rows ``(P, 2)`` of areas, the lower number first; differences of height ``(P,)``, metres; and
+        sums of both distances ``(P,)``, metres.
     """
     wide = shapely.buffer(areas, reach_m, join_style="mitre")
     first, second = shapely.STRtree(wide).query(wide, predicate="intersects")
@@ -103,10 +106,29 @@ def touching_pairs(areas: Any, outlines: Sequence[F64], reach_m: float) -> tuple
     places = shapely.point_on_surface(shared[has_area])
     lines = np.array([_line_of(outline) for outline in outlines], dtype=object)
     heights = []
+    away_m = np.zeros(len(pairs))
     for number in pairs.T:
         along = shapely.line_locate_point(lines[number], places)
         heights.append(shapely.get_z(shapely.line_interpolate_point(lines[number], along)))
-    return pairs, np.abs(heights[0] - heights[1])
+        away_m += shapely.distance(lines[number], places)
+    return pairs, np.abs(heights[0] - heights[1]), away_m
+
+
+def distance_and_rise(line: F64, xyz: F64) -> tuple[F64, F64]:
+    """Return how far ``(T,)`` a polyline ``(N, 3)`` is from points ``(T, 3)`` in plan view, and how
+    far it is above or below them there: where it passes several times equally near, as a road that
+    winds above itself, at the height of the passage that is nearest in height.
+    """
+    start = line if len(line) == 1 else line[:-1]
+    step = np.zeros((1, 3)) if len(line) == 1 else np.diff(line, axis=0)
+    length2 = np.maximum(np.sum(step[:, :2] ** 2, axis=1), 1e-12)
+    offset = xyz[:, None, :2] - start[None, :, :2]  # (T, N - 1, 2)
+    share = np.clip(np.sum(offset * step[None, :, :2], axis=2) / length2, 0.0, 1.0)
+    away_m = np.linalg.norm(offset - share[..., None] * step[None, :, :2], axis=2)
+    rise_m = np.abs(start[:, 2] + share * step[:, 2] - xyz[:, None, 2])
+    nearest_m = away_m.min(axis=1)
+    is_near = away_m <= nearest_m[:, None] + PASSAGE_M
+    return nearest_m, np.where(is_near, rise_m, np.inf).min(axis=1)
 
 
 def _line_of(outline: F64) -> Any:

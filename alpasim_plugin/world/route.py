@@ -25,7 +25,7 @@ from alpasim_plugin.core.geometry import (
     yaw_from_quat,
     yaw_of,
 )
-from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, lane_polygon
+from alpasim_plugin.core.lane_areas import HALF_WIDTH_M, distance_and_rise, lane_polygon
 from alpasim_plugin.core.types import F64, I64, LaneMap, Route, Trajectory
 
 VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often
@@ -33,7 +33,6 @@ VERTEX_STEP_M = 1.0  # the KD-trees hold a centre vertex at least this often
 # so much above or below its middle, or the recording so much above the map; decks of car parks are
 # 2.5 m apart and more.
 LEVEL_M = 2.0
-NEAR_M = 1.0  # places of a lane's middle that are no farther from a point than the nearest and this
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class LaneIndex:
             if np.ptp(line[:, 2]) == 0:
                 out[pairs] = np.abs(line[0, 2] - xyz[:, 2])
                 continue
-            out[pairs] = [_height_apart_m(line, place) for place in xyz]
+            _, out[pairs] = distance_and_rise(line, xyz)
         return out
 
     def within(self, point: F64, radius_m: float) -> tuple[str, ...]:
@@ -180,17 +179,6 @@ class LaneIndex:
             inside = s < distance_m
             xyz = np.concatenate([xyz[inside], resample(xyz, [distance_m])])
         return LanePath(tuple(ids), xyz)
-
-
-def _height_apart_m(line: F64, point: F64) -> float:
-    """Return how far the middle ``(N, 3)`` of a lane is above or below a point ``(3,)``."""
-    if len(line) < 2:
-        return float(np.abs(line[0, 2] - point[2]))
-    _, share, offset = _on_segments(line, point[:2])
-    away_m = np.linalg.norm(offset, axis=1)
-    height_m = line[:-1, 2] + share * np.diff(line[:, 2])
-    is_near = away_m <= away_m.min() + NEAR_M
-    return float(np.abs(height_m[is_near] - point[2]).min())
 
 
 def _end_heading(line: F64, last: bool) -> float:

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.geometry import arc_lengths
-from alpasim_plugin.core.lane_areas import touching_pairs
+from alpasim_plugin.core.lane_areas import distance_and_rise, touching_pairs
 from alpasim_plugin.core.types import F64, I64, Bool
 from evaluators.metrics.footprint import Geometries
 
@@ -94,27 +93,22 @@ class Surface:
             0.0,
         )
         at_least_m = np.hypot(outside[..., 0], outside[..., 1])  # (T, B)
-        rise_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
-        out = rise_m <= self._level_m + SLOPE * at_least_m
+        most_m = np.maximum(high[None, :, 2] - xyz[:, None, 2], xyz[:, None, 2] - low[None, :, 2])
+        out = most_m <= self._level_m + SLOPE * at_least_m
         for b in np.flatnonzero(~out.all(axis=0)):
             rows = np.flatnonzero(~out[:, b])
-            line = self._outlines[b]
-            flat = shapely.linestrings(line[:, :2])
-            points = shapely.points(xyz[rows, :2])
-            z = np.interp(shapely.line_locate_point(flat, points), arc_lengths(line), line[:, 2])
-            out[rows, b] = np.abs(z - xyz[rows, 2]) <= self._level_m + SLOPE * shapely.distance(
-                flat, points
-            )
+            away_m, rise_m = distance_and_rise(self._outlines[b], xyz[rows])
+            out[rows, b] = rise_m <= self._level_m + SLOPE * away_m
         return self._without_stacked(out, xyz)
 
     @cached_property
     def _stacked(self) -> I64:
-        """Pairs ``(P, 2)`` of areas that lie above one another."""
+        """Pairs ``(P, 2)`` of areas that lie above one another, and not on one slope."""
         no_pairs = np.zeros((0, 2), dtype=np.int64)
         if not len(self._bounds) or np.ptp(self._bounds[:, :, 2]) <= self._level_m:
             return no_pairs
-        pairs, apart_m = touching_pairs(self._areas, self._outlines, self._seam_m / 2)
-        return pairs[apart_m > self._level_m]
+        pairs, apart_m, away_m = touching_pairs(self._areas, self._outlines, self._seam_m / 2)
+        return pairs[apart_m > self._level_m + SLOPE * away_m]
 
     def _without_stacked(self, level: Bool, xyz: F64) -> Bool:
         """Return ``level (T, B)`` with, of two areas above one another, only the one that is nearer
@@ -125,17 +119,12 @@ class Surface:
             rows = np.flatnonzero(level[:, pair].all(axis=1))
             if not len(rows):
                 continue
-            first_m, second_m = (self._rise_m(number, xyz[rows]) for number in pair)
+            first_m, second_m = (
+                distance_and_rise(self._outlines[number], xyz[rows])[1] for number in pair
+            )
             out[rows, pair[0]] &= first_m <= second_m + TIE_M
             out[rows, pair[1]] &= second_m <= first_m + TIE_M
         return out
-
-    def _rise_m(self, area: int, xyz: F64) -> F64:
-        """Return how far ``(T,)`` an area is above or below points ``(T, 3)`` where it is nearest."""
-        line = self._outlines[area]
-        flat = shapely.linestrings(line[:, :2])
-        along = shapely.line_locate_point(flat, shapely.points(xyz[:, :2]))
-        return np.abs(np.interp(along, arc_lengths(line), line[:, 2]) - xyz[:, 2])
 
     def region(self, chosen: Bool) -> Region:
         """Return the joined areas marked in ``(B,)``; kept, as neighbouring steps share them."""

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import shapely
 
 from alpasim_plugin.core.types import Box, Lane
 from evaluators import PRESETS
 from evaluators.metrics.collision import contact_events
+from evaluators.metrics.surface import Surface
 from tests.evaluators.eval_build import (
     CAR,
     VEHICLE,
@@ -168,3 +170,24 @@ def test_presets_that_look_from_above_take_the_road_above_for_the_ego_s_own():
         assert not scored(log, stacked_map(3.0), preset)["offroad"].value.any()
     for preset in ("strict", "nuplan", "navsim"):
         assert PRESETS[preset].lane_height_m == 2.0
+
+
+def test_a_wide_area_on_a_slope_is_not_stacked_on_its_lane():
+    """A square of 100 by 50 m that rises by 10 % across, and a lane in its middle."""
+    corners = np.array([[0, -25], [100, -25], [100, 25], [0, 25], [0, -25]], dtype=np.float64)
+    ring = np.column_stack([corners, 0.1 * corners[:, 1]])
+    centre = np.array([[0.0, 0, 0], [100.0, 0, 0]])
+    areas = np.array([shapely.box(0, -1.75, 100, 1.75), shapely.Polygon(corners)])
+    square = Surface(areas, [centre, ring], 0.5, 2.0)
+    assert square.on_level(np.array([[50.0, 1.5, 0.15], [50.0, 20.0, 2.0]])).all(axis=0)[1]
+    assert square.on_level(np.array([[50.0, 1.5, 0.15]])).all()
+
+
+@pytest.mark.parametrize("pitch_m", [2.5, 3.0, 4.0])
+def test_a_lane_that_winds_above_itself_is_on_the_level_of_both_turns(pitch_m):
+    angle = np.linspace(0, 4 * np.pi, 200)
+    line = np.column_stack([15 * np.cos(angle), 15 * np.sin(angle), pitch_m * angle / (2 * np.pi)])
+    area = shapely.buffer(shapely.linestrings(line[:, :2]), 2.0)
+    ramp = Surface(np.array([area]), [line], 0.5, 2.0)
+    assert ramp.on_level(line + np.array([0.3, 0.0, 0.1])).all()
+    assert not ramp.on_level(line[[20]] + [0, 0, 2 * pitch_m + 2.0]).any()
