@@ -2,7 +2,12 @@
 between lanes of opposite directions.
 """
 
+import re
+from collections.abc import Iterable
+
 from alpasim_plugin.core.types import LaneMarkType
+
+CODE = re.compile("[A-Za-z]{2,3}")
 
 # Codes of ISO 3166 of countries whose lines between opposite directions are yellow.
 YELLOW = frozenset(
@@ -42,6 +47,15 @@ JAPAN = (
     (132.0, 33.5, 142.2, 41.6),
     (139.3, 41.3, 146.0, 45.6),
 )
+
+
+def country_of(codes: Iterable[str]) -> str | None:
+    """Return the country that the roads of a map name; None where they name none, or countries with
+    different lines. What has not two or three letters is no code of ISO 3166.
+    """
+    named = sorted({code.upper() for code in codes if CODE.fullmatch(code)})
+    lines = {centre_line(code) for code in named}
+    return named[0] if len(lines) == 1 else None
 
 
 def centre_line(country: str | None) -> LaneMarkType:

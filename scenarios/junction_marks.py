@@ -6,14 +6,15 @@ along the carriageway of a motorway beside a ramp.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import shapely
 
-from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.lane_areas import distance_and_rise, lane_polygon
 from alpasim_plugin.core.types import F64, Lane, LaneMarkType
+from alpasim_plugin.world.route import LEVEL_M
 
 INSIDE_M = 0.3  # a line that runs so near to the edge of a lane lies on that edge
 CROSSED_M = 0.5  # length of a line inside of another lane from which on it is crossed
@@ -38,10 +39,13 @@ def with_open_junctions(
     for keys in members.values():
         insides = [shapely.buffer(lane_polygon(lanes[key]), -INSIDE_M) for key in keys]
         tree = shapely.STRtree(insides)
+        centres = [lanes[key].centre for key in keys]
         for key in keys:
             lane = lanes[key]
-            left = _painted(lane.left_mark_type, lane.left, (key, "left"), guides, tree)
-            right = _painted(lane.right_mark_type, lane.right, (key, "right"), guides, tree)
+            left = _painted(lane.left_mark_type, lane.left, (key, "left"), guides, tree, centres)
+            right = _painted(
+                lane.right_mark_type, lane.right, (key, "right"), guides, tree, centres
+            )
             out[key] = replace(lane, left_mark_type=left, right_mark_type=right)
     return out
 
@@ -52,11 +56,17 @@ def _painted(
     side: Side,
     guides: Collection[Side],
     insides: shapely.STRtree,
+    centres: Sequence[F64],
 ) -> LaneMarkType:
-    """Return the marking of an edge ``(N, 3)``: none where lanes lead over it."""
+    """Return the marking of an edge ``(N, 3)``: none where lanes lead over it at its height."""
     if edge is None or mark_type == "none" or side in guides:
         return mark_type
-    line: Any = shapely.linestrings(edge[:, :2])
-    crossing = insides.geometries.take(insides.query(line, predicate="intersects"))
-    inside_m = shapely.length(shapely.intersection(crossing, line))
-    return "none" if (inside_m > CROSSED_M).any() else mark_type
+    line: Any = shapely.linestrings(edge)
+    rows = insides.query(line, predicate="intersects")
+    parts = shapely.intersection(line, insides.geometries.take(rows))
+    for row, part in zip(rows.tolist(), parts, strict=True):
+        if shapely.length(part) > CROSSED_M:
+            middle = shapely.get_coordinates(part, include_z=True).mean(axis=0)
+            if distance_and_rise(centres[row], middle[None])[1][0] <= LEVEL_M:
+                return "none"
+    return mark_type

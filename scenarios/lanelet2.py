@@ -359,7 +359,7 @@ def _read_lanelets(osm: Osm, limits: Mapping[str, float | None]) -> Lanelets:
         if kind != "vehicle" and participants:
             lanelets.reserved[f"{subtype} are for {users} and not for cars"] += 1
         lanelets.bounds[key] = left, right
-        lanelets.lanes[key] = _lane(osm, key, kind, left, right, limits.get(key))
+        lanelets.lanes[key] = _lane(osm, key, kind, left, right, limits.get(key), subtype)
     return lanelets
 
 
@@ -370,10 +370,13 @@ def _add_opposite_lanes(osm: Osm, lanelets: Lanelets, limits: Mapping[str, float
     bounds = lanelets.bounds
     lanelets.lanes = mark_intersections(_linked(lanelets.lanes, bounds))
     for key, lane in [*lanelets.lanes.items()]:
-        if osm.lanelets[key].tags.get("one_way") in ("no", "false"):
+        tags = osm.lanelets[key].tags
+        if tags.get("one_way") in ("no", "false"):
+            subtype = tags.get("subtype", "road")
             left, right = bounds[key]
             bounds[f"-{key}"] = right.turned(), left.turned()
-            back = _lane(osm, f"-{key}", lane.kind, *bounds[f"-{key}"], limits.get(key))
+            turned = bounds[f"-{key}"]
+            back = _lane(osm, f"-{key}", lane.kind, *turned, limits.get(key), subtype)
             lanelets.lanes[f"-{key}"] = replace(back, is_intersection=lane.is_intersection)
 
 
@@ -475,7 +478,7 @@ def _one_way(lanelet: Item, side: str) -> str:
 
 
 def _lane(
-    osm: Osm, key: str, kind: str, left: Bound, right: Bound, limit_mps: float | None
+    osm: Osm, key: str, kind: str, left: Bound, right: Bound, limit_mps: float | None, subtype: str
 ) -> Lane:
     lines = osm.line(left.nodes), osm.line(right.nodes)
     lane = Lane(
@@ -486,7 +489,7 @@ def _lane(
         left_mark_type=_mark_type(osm.items["way"][left.way]),
         right_mark_type=_mark_type(osm.items["way"][right.way]),
         speed_limit_mps=limit_mps,
-        is_motorway=osm.lanelets[key.removeprefix("-")].tags.get("subtype") == "highway",
+        is_motorway=subtype == "highway",
     )
     even_left, even_right = rails(lane)
     return replace(lane, left=even_left, right=even_right)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.lane_areas import distance_and_rise, lane_polygon
 from alpasim_plugin.core.types import F64, Lane
 
 BESIDE_M = 0.6  # of a post from the carriageway
@@ -50,16 +50,14 @@ class Carriageway:
     def _areas(self) -> shapely.STRtree:
         return shapely.STRtree([lane_polygon(lane) for lane in self._lanes])
 
-    @cached_property
-    def _heights(self) -> F64:
-        """Return the lowest and the highest point ``(N, 2)`` of each lane."""
-        return np.array([[z.min(), z.max()] for lane in self._lanes for z in [lane.centre[:, 2]]])
-
     def around(self, place: F64) -> Any:
         """Return the carriageway around a place ``(3,)`` on its level as a shapely area."""
         rows = self._areas.query(shapely.points(place[:2]), predicate="dwithin", distance=AROUND_M)
-        low, high = self._heights[rows].T
-        on_level = (low < place[2] + LEVEL_M) & (high > place[2] - LEVEL_M)
+        rises_m = [
+            float(distance_and_rise(self._lanes[row].centre, place[None])[1][0])
+            for row in rows.tolist()
+        ]
+        on_level = np.array(rises_m) < LEVEL_M
         area = shapely.union_all(self._areas.geometries[rows[on_level]])
         return shapely.buffer(shapely.buffer(area, SEAM_M), -SEAM_M)
 

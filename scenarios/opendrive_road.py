@@ -24,6 +24,7 @@ from alpasim_plugin.core.files import parsing, some_of
 from alpasim_plugin.core.files.limits import LIMIT_MPS, MAP_CURVATURE_PER_M, MAP_ROAD_M
 from alpasim_plugin.core.geometry import transform_points
 from alpasim_plugin.core.types import F64
+from scenarios.countries import country_of
 from scenarios.opendrive_fields import OPENDRIVE
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
@@ -316,8 +317,7 @@ def parse_map(location: Path | str, root: Element) -> OdrMap:
     }
     geo_reference = (root.findtext(".//geoReference") or "").strip()
     notes = (*_odd_sides(elements), *OPENDRIVE.notes_of_xml(root), *_notes(root, unused))
-    countries = {kind.get("country", "").upper() for kind in root.iterfind("road/type")} - {""}
-    country = countries.pop() if len(countries) == 1 else None
+    country = country_of(kind.get("country", "") for kind in root.iterfind("road/type"))
     return OdrMap(tuple(roads), connections, geo_reference, controllers, notes, country)
 
 

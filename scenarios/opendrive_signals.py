@@ -5,7 +5,7 @@ Source: ASAM OpenDRIVE 1.4 to 1.8, chapters on signals and objects.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,7 +67,7 @@ def roadside(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LaneMa
         {},
         crosswalks=tuple(crosswalks),
         stop_lines=tuple(stop_lines),
-        poles=tuple(post.line for post in light_posts(odr, lanes, T_local_map).values()),
+        poles=tuple(post.line for post in light_posts(odr, lanes, T_local_map).by_place.values()),
         signs=tuple(signs),
     )
 
@@ -88,8 +88,10 @@ def traffic_lights(
     posts = light_posts(odr, lanes, T_local_map)
     for road in _roads(odr, lanes):
         for light in (signal for signal in road.signals if signal.dynamic):
+            post = posts.of(road, light)
+            lamps = None if post is None else post.lamps
             light_heads = [
-                replace(head, signal=replace(head.signal, head=posts[light.signal_id].lamps))
+                replace(head, signal=replace(head.signal, head=lamps))
                 for head in _heads(road, light, odr.controllers, lanes, T_local_map)
             ]
             heads += light_heads
@@ -117,19 +119,47 @@ def give_way_lines(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> 
     )
 
 
-def light_posts(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> dict[str, Post]:
-    """Return the post of every traffic light. It stands once, where the map writes the light: what
-    other roads say of it by reference is whom it holds.
+Place = tuple[str, str, float, float]  # a road, a light on it, and its place there: s and t, metres
+
+
+@dataclass(frozen=True)
+class LightPosts:
+    """The posts of the traffic lights of a map. Each stands once, where the map writes the light:
+    what other roads say of it by reference is whom it holds.
+
+    Attributes:
+        by_place: The posts. Some maps give several lights one id.
+        by_id: Of lights with one id the first, for references.
     """
+
+    by_place: Mapping[Place, Post]
+    by_id: Mapping[str, Post]
+
+    def of(self, road: Road, light: RoadSignal) -> Post | None:
+        """Return the post of a light; None of a reference to one that stands nowhere."""
+        if light.by_reference:
+            return self.by_id.get(light.signal_id)
+        return self.by_place.get(_place(road, light))
+
+
+def _place(road: Road, light: RoadSignal) -> Place:
+    return road.road_id, light.signal_id, light.s_m, light.t_m
+
+
+def light_posts(odr: OdrMap, lanes: Mapping[str, Lane], T_local_map: F64) -> LightPosts:
+    """Return the posts of the traffic lights of a map."""
     surface = Carriageway(lanes)
-    posts = {}
+    by_place: dict[Place, Post] = {}
+    by_id: dict[str, Post] = {}
     for road in odr.roads:
         for light in (signal for signal in road.signals if signal.dynamic):
             if not light.by_reference and road.records:
                 foot = placed(road, np.array([[light.s_m, light.t_m]]), T_local_map)[0]
                 lamps_m = light.above_m + light.height_m / 2
-                posts[light.signal_id] = surface.post(foot, lamps_m)
-    return posts
+                post = surface.post(foot, lamps_m)
+                by_place[_place(road, light)] = post
+                by_id.setdefault(light.signal_id, post)
+    return LightPosts(by_place, by_id)
 
 
 def _roads(odr: OdrMap, lanes: Mapping[str, Lane]) -> list[Road]:

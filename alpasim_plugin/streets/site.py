@@ -40,7 +40,9 @@ SHIFT_BITS = 4  # sub-pixel bits of the polygon filler
 HIGHWAY_MPS = 22.0
 TILE_M = 32.0  # a section owns whole tiles; all grids of the ground are cut along them
 WIDEST_ISLAND_M = 100.0  # of the middle of a roundabout
-ROUND = 0.88  # share of a round island that its inscribed circle covers; of a square it is 0.79
+ROUND = (
+    0.93  # of a round island, the share that the largest circle in it covers; of a hexagon 0.907
+)
 HORIZON_M = 160.0  # large Gaussians lie so far around the rasters
 SECTION_M = 250  # of the path
 OVERLAP_M = 40  # a section's path goes on into its neighbours

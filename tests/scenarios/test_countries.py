@@ -2,7 +2,7 @@
 
 import pytest
 
-from scenarios.countries import centre_line, country_at
+from scenarios.countries import centre_line, country_at, country_of
 from scenarios.load import load_scenario
 from tests.files.opendrive_text import lane, road, section
 
@@ -58,3 +58,16 @@ def test_places_in_japan_are_known(lat_deg, lon_deg, country):
 def test_codes_of_both_lengths_are_read():
     assert centre_line("usa") == centre_line("US") == "double_yellow"
     assert centre_line("DEU") == centre_line("jp") == "dashed_white"
+
+
+@pytest.mark.parametrize(
+    ("codes", "line"),
+    [
+        (["DE", "DEU", ""], "dashed_white"),
+        (["US", "CAN"], "double_yellow"),
+        (["US", "DE"], "double_yellow"),  # no country
+        (["OpenDRIVE", "UNKNOWN", "7"], "double_yellow"),
+    ],
+)
+def test_the_country_of_a_map_is_that_of_all_its_roads(codes, line):
+    assert centre_line(country_of(codes)) == line

@@ -7,6 +7,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.types import Lane
 from scenarios.light_posts import BESIDE_M, LOWEST_M, LOWEST_OVER_LANES_M, Carriageway
 from scenarios.opendrive import read_lanes
 from scenarios.opendrive_road import parse_map
@@ -63,6 +64,12 @@ def test_roads_that_cross_outside_of_junctions_keep_their_lines():
     assert marks(lanes["east.0.-1"]) == ("solid_yellow", "solid_yellow")
 
 
+def test_roads_above_one_another_in_a_junction_keep_their_lines():
+    height = '<elevationProfile><elevation s="0" a="6" b="0" c="0" d="0"/></elevationProfile>'
+    _, lanes = parsed(EAST, NORTH.replace("<lanes>", f"{height}<lanes>"))
+    assert marks(lanes["east.0.-1"]) == marks(lanes["north.0.-1"]) == ("solid_yellow",) * 2
+
+
 def signal(name, t_m, s_m=10.0, above_m=0.0):
     return (
         f'<signal id="{name}" s="{s_m}" t="{t_m}" type="1000001" dynamic="yes" orientation="+" '
@@ -72,7 +79,7 @@ def signal(name, t_m, s_m=10.0, above_m=0.0):
 
 def test_a_light_over_lanes_hangs_from_a_mast_whose_post_stands_beside_them():
     odr, lanes = parsed(one_lane("wide", 0, 0, 0.0, signals=signal("over", -1.6)))
-    post = light_posts(odr, lanes, np.eye(4))["over"]
+    post = light_posts(odr, lanes, np.eye(4)).by_id["over"]
     road = lane_polygon(lanes["wide.0.-1"])
     assert shapely.distance(road, shapely.Point(post.line[0, :2])) == pytest.approx(BESIDE_M)
     assert post.line[0, 2] == pytest.approx(0.0)
@@ -83,13 +90,13 @@ def test_a_light_over_lanes_hangs_from_a_mast_whose_post_stands_beside_them():
 
 def test_a_light_beside_the_road_stands_where_the_map_has_it():
     odr, lanes = parsed(one_lane("a", 0, 0, 0.0, signals=signal("near", -6.0, above_m=-0.5)))
-    post = light_posts(odr, lanes, np.eye(4))["near"]
+    post = light_posts(odr, lanes, np.eye(4)).by_id["near"]
     assert post.line == pytest.approx(np.array([[10.0, -6.0, 0.0], [10.0, -6.0, LOWEST_M]]))
 
 
 def test_a_light_at_the_edge_moves_beside_the_road_with_its_lamps():
     odr, lanes = parsed(one_lane("a", 0, 0, 0.0, signals=signal("edge", -3.3)))
-    post = light_posts(odr, lanes, np.eye(4))["edge"]
+    post = light_posts(odr, lanes, np.eye(4)).by_id["edge"]
     assert len(post.line) == 2
     assert post.line[:, 1] == pytest.approx([-3.5 - BESIDE_M] * 2)
 
@@ -116,3 +123,22 @@ def test_a_road_on_a_bridge_does_not_move_a_post_below_it():
     foot = np.array([0.0, -1.75, 0.0])
     assert len(Carriageway(lanes).post(foot, 5.0).line) == 4
     assert len(Carriageway(raised).post(foot, 5.0).line) == 2
+
+
+def test_lights_of_one_id_have_a_post_each():
+    both = signal("same", -6.0) + signal("same", -6.0, s_m=30.0)
+    odr, lanes = parsed(one_lane("a", 0, 0, 0.0, signals=both))
+    assert sorted(pole[0, 0] for pole in roadside(odr, lanes, np.eye(4)).poles) == pytest.approx(
+        [10.0, 30.0]
+    )
+    heads, _ = traffic_lights(odr, lanes, np.eye(4))
+    assert sorted(head.signal.head[0] for head in heads) == pytest.approx([10.0, 30.0])
+
+
+def test_a_lane_that_climbs_over_a_post_does_not_move_it():
+    x = np.linspace(0.0, 100.0, 51)
+    centre = np.column_stack([x, np.zeros(51), 0.06 * x])
+    beside = np.array([0.0, 1.75, 0.0])
+    climbing = Lane("up", centre, centre + beside, centre - beside)
+    post = Carriageway({"up": climbing}).post(np.array([95.0, 0.0, 0.0]), 5.0)
+    assert post.line[:, :2] == pytest.approx(np.array([[95.0, 0.0]] * 2))

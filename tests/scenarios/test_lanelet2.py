@@ -269,6 +269,13 @@ def sign(subtype="speed_limit", refers=(), **more):
     return relation(8, [("way", "refers", way) for way in refers], kind)
 
 
+def test_ids_of_new_objects_are_negative(tmp_path):
+    """Editors of maps write them so before a map has its ids."""
+    parts = [re.sub(r'(id|ref)="(\d+)"', r'\1="-\2"', part) for part in STREET]
+    negative, lanes = street(tmp_path, parts).lanes, street(tmp_path).lanes
+    assert sorted(negative) == sorted(f"-{key}" for key in lanes)
+
+
 @pytest.mark.parametrize(
     ("rule", "more", "limit_kph"),
     [

@@ -47,6 +47,16 @@ def test_the_middle_of_a_roundabout_is_an_island_and_a_block_is_not(street):
     assert not site.islands[site.road].any()
 
 
+def test_a_hexagonal_block_is_no_island(street):
+    h, w = street.road.shape
+    road = np.zeros((h, w), dtype=np.uint8)
+    angle = np.arange(6) * np.pi / 3 + 0.3
+    for size_m, value in ((32.0, 1), (25.0, 0)):
+        corners = np.column_stack([np.cos(angle), np.sin(angle)]) * size_m / CELL_M
+        cv2.fillPoly(road, [np.int32(corners + np.array([w // 2, h // 2]))], value)
+    assert not with_road(street, road.astype(bool)).islands.any()
+
+
 def test_houses_stand_in_a_block_and_not_on_an_island(street):
     road, circle, square = round_and_square(street, 25.0)
     environment = replace(street.scenario.environment, buildings=1.0)
