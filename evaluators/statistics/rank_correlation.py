@@ -89,7 +89,11 @@ def group_difference(x: F64, other: F64, y: F64, groups: Sequence[str]) -> Inter
     centre = difference(range(len(x)))
     if centre is None:
         return None
-    interval = _too_few(y, groups) or _jackknife(difference, groups, lambda value: value)
+    sides = (y, x, other)
+    reasons = [reason for side in sides if (reason := _too_few(side, groups)) is not None]
+    if abs(spearman(x, y) or 0.0) >= PERFECT and abs(spearman(other, y) or 0.0) >= PERFECT:
+        reasons.append(DEPENDS)
+    interval = reasons[0] if reasons else _jackknife(difference, groups, lambda value: value)
     if isinstance(interval, str):
         return Interval(centre, reason=interval)
     low, high = interval

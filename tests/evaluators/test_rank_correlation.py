@@ -149,3 +149,13 @@ def test_two_values_have_an_interval_where_six_groups_hold_the_rarer(changed, is
     for interval in (group_spearman(x, y, groups), group_difference(x, -x, y, groups)):
         assert (interval.low is not None) == is_bounded
         assert is_bounded or f"stands in {changed} groups" in interval.reason
+
+
+def test_a_difference_needs_enough_of_the_rarer_value_on_every_side_and_no_two_perfect_orders():
+    rng = np.random.default_rng(9)
+    y = rng.normal(size=24)
+    groups = [f"g{number // 3}" for number in range(24)]
+    rare = np.repeat(np.arange(8) < 2, 3).astype(float)
+    assert group_difference(rare, rng.normal(size=24), y, groups).low is None
+    assert group_difference(rng.normal(size=24), rare, y, groups).low is None
+    assert group_difference(y, 2 * y, y, groups).low is None
