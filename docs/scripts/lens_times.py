@@ -104,8 +104,8 @@ def row_of(name: str, threads: int, repeats: int) -> list[str]:
     )
     ratios = [f"{one_ms / pinholes_ms:.2f}", f"{rolling_ms / one_ms:.2f}"]
     size = f"{request.camera.width}x{request.camera.height}"
-    one, other, shutter = (f"{value:.0f}" for value in (one_ms, pinholes_ms, rolling_ms))
-    return [name, size, one, other, ratios[0], shutter, ratios[1]]
+    times = [f"{value:.0f}" for value in (one_ms, pinholes_ms, rolling_ms)]
+    return [name, size, times[0], times[1], ratios[0], times[2], ratios[1]]
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ import numpy as np
 import shapely
 from pages import table
 
+from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.geometry import rectangle_corners, yaw_from_quat
+from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.core.types import Actor, RolloutLog, Scenario
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.runs.renderer import make_renderer
@@ -42,6 +44,7 @@ LEVEL_M = 2.0  # boxes whose middles are farther apart in height do not touch
 JUMP_MPS2 = 12.0  # what no tyre gives
 STANDS_MPS = 0.1
 AT_LINE_M = 8.0  # from the middle of the ego to the line of a light that it has just passed
+TRIES = 20  # routes are drawn for each that shall pass a light
 CYCLES = 2  # of a light, for which a road user may stand
 
 
@@ -117,7 +120,7 @@ def is_held(scenario: Scenario, log: RolloutLog, t_us: int) -> bool:
     row = int(np.searchsorted(log.ego.t_us, t_us))
     place = shapely.Point(log.ego.xyz[row, :2])
     return any(
-        signal.colour_at(t_us) != "green"
+        signal.colour_at(t_us) == "red"
         and not set(signal.lanes).isdisjoint(scenario.route.lane_ids)
         and shapely.LineString(signal.stop[:, :2]).distance(place) < AT_LINE_M
         for signal in scenario.lane_map.signals or ()
@@ -168,6 +171,8 @@ def scenes_of(folder: Path, path: Path, options: argparse.Namespace) -> Iterator
     scenes.mkdir(parents=True, exist_ok=True)
     seed = wanted = 0
     while wanted < options.routes:
+        if seed >= TRIES * options.routes:
+            raise SystemExit(f"{path}: {wanted} of {seed} routes pass a light; leave --lights out")
         scene = scenes / f"{path.stem.lower()}_{seed}.yaml"
         text = SCENE.format(seed=seed, path=path.resolve(), length_m=options.length)
         scene.write_text(text, encoding="utf-8")
@@ -185,15 +190,11 @@ def loaded(scene: Path) -> Scenario:
 
 def passes_light(scene: Path) -> bool:
     """Return whether the route of a scene passes a traffic light before its goal."""
-    answer = scene.with_suffix(".light.json")
-    if not answer.exists():
-        scenario = loaded(scene)
-        lane_map = scenario.lane_map
-        line = scenario.ego_log.xyz
-        path = smooth_path(line[thinned(line, 1.0)])
-        lights = lights_on(path, lane_map.signals, lane_map.lanes)
-        answer.write_text(json.dumps(len(lights) > 0), encoding="utf-8")
-    return bool(json.loads(answer.read_text(encoding="utf-8")))
+    scenario = loaded(scene)
+    lane_map = scenario.lane_map
+    line = scenario.ego_log.xyz
+    path = smooth_path(line[thinned(line, 1.0)])
+    return len(lights_on(path, lane_map.signals, lane_map.lanes)) > 0
 
 
 def drives_of(folder: Path, path: Path, options: argparse.Namespace) -> dict[str, list[Drive]]:
@@ -202,14 +203,27 @@ def drives_of(folder: Path, path: Path, options: argparse.Namespace) -> dict[str
     for scene in scenes_of(folder, path, options):
         for policy, done in drives.items():
             record = folder / "drives" / f"{scene.stem}-{policy}.json"
-            if not record.exists():
-                record.parent.mkdir(exist_ok=True)
-                record.write_text(
-                    json.dumps(asdict(drive(loaded(scene), policy))), encoding="utf-8"
-                )
-            done.append(Drive(**json.loads(record.read_text(encoding="utf-8"))))
+            done.append(driven_once(record, scene, policy, file_sha256(path)))
             print(record.stem, done[-1], flush=True)
     return drives
+
+
+def driven_once(record: Path, scene: Path, policy: str, map_sha256: str) -> Drive:
+    """Return a drive, from its record where the scene, its map and the program are the same."""
+    made_by = {
+        "scene": file_sha256(scene),
+        "map": map_sha256,
+        "program": package_digest(),
+    }
+    if record.exists():
+        stored = json.loads(record.read_text(encoding="utf-8"))
+        if stored.get("made_by") != made_by:
+            raise SystemExit(f"{record}: of another scene, map or program; name another folder")
+        return Drive(**stored["drive"])
+    result = drive(loaded(scene), policy)
+    record.parent.mkdir(exist_ok=True)
+    record.write_text(json.dumps({"made_by": made_by, "drive": asdict(result)}), encoding="utf-8")
+    return result
 
 
 def row_of(name: str, policy: str, drives: list[Drive]) -> list[str]:

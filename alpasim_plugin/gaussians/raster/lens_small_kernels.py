@@ -70,8 +70,8 @@ from alpasim_plugin.gaussians.raster.project_kernels import BLOCK_HALF, dot, loa
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT
 
 WIDEST = 0.03  # radians: the most standard deviations across of a small Gaussian
-# Shutters from the middle at which a mean may be seen: of what lies beside the image the time goes on
-# evenly, as in what of it is inside.
+# Shutters from the middle at which a mean may be seen. Beside the image the time of a row goes on to
+# grow as it does from row to row inside.
 BEYOND = 0.55
 MOST_CHANGE = 0.25  # of a step in the image by what moves while it is exposed
 
