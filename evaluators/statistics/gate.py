@@ -26,6 +26,7 @@ from alpasim_plugin.core.files.config import (
 from alpasim_plugin.core.json_types import JsonObject, JsonView
 from alpasim_plugin.log.run_folder.sides import RolloutTable, Side
 from evaluators.metrics import METRICS, MetricInfo, MetricTable
+from evaluators.metrics.measured import BEYOND
 from evaluators.metrics.presets import DEFAULT, PRESETS
 from evaluators.metrics.presets import preset as find_preset
 from evaluators.results import Cause, Failures, Outcome, Verdict, to_json
@@ -134,6 +135,12 @@ class GateSpec(_Strict):
         description="Share of rollouts that may lack a pair, per metric.",
     )
     metrics: dict[str, MetricRule] = Field(default={}, min_length=1, description="Metric to rule.")
+    max_beyond_measured: float | None = Field(
+        default=None,
+        ge=0.0,
+        le=1.0,
+        description="Largest mean share of steps beyond where what a renderer shows was compared with the truth.",
+    )
     boundary_margin: float | None = Field(
         default=None,
         ge=0.0,
@@ -142,10 +149,13 @@ class GateSpec(_Strict):
 
     @model_validator(mode="after")
     def _decides_about_its_population(self) -> GateSpec:
-        if bool(self.metrics) == (self.boundary_margin is not None):
+        averages = bool(self.metrics) or self.max_beyond_measured is not None
+        if averages == (self.boundary_margin is not None):
             raise ValueError(
-                "a gate needs either metrics or boundary_margin | points of a search are not averaged: write two gates"
+                "a gate needs either metrics (or max_beyond_measured) or boundary_margin | points of a search are not averaged: write two gates"
             )
+        if self.max_beyond_measured is not None and BEYOND in self.metrics:
+            raise ValueError(f"max_beyond_measured and a rule for {BEYOND} | remove one of them")
         binding = [rule for rule in self.metrics.values() if rule.is_paired and rule.must_decide]
         if self.population == "scenes" and not binding:
             raise ValueError(
@@ -338,9 +348,12 @@ def _limits(
     side: Side, variant: Variant, name: str, spec: GateSpec, metric_table: MetricTable
 ) -> list[Check]:
     """Test the means of a variant against the limits that the gate sets."""
+    rules = dict(spec.metrics)
+    if spec.max_beyond_measured is not None:
+        rules[BEYOND] = MetricRule(max=spec.max_beyond_measured)
     return [
         _limit(side, variant, name, metric_table.info(metric), rule, spec)
-        for metric, rule in spec.metrics.items()
+        for metric, rule in rules.items()
         if rule.max is not None or rule.min is not None
     ]
 

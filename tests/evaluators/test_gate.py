@@ -399,6 +399,28 @@ def test_a_stored_baseline_meets_the_renderer_of_the_same_name():
     assert verdict.baseline == "main.json"
 
 
+def with_beyond(shares):
+    run = rows()
+    for row, share in zip(run, itertools.cycle(shares), strict=False):
+        row["beyond_measured_share"] = share
+        row["beyond_measured_share_valid"] = share is not None
+    return run
+
+
+@pytest.mark.parametrize(
+    ("shares", "wanted"), [([0.0, 0.2], 0), ([0.1, 0.2], 1), ([0.0, None], 2), ([None], 2)]
+)
+def test_a_gate_limits_how_much_lies_beyond_what_was_compared(shares, wanted):
+    spec = GateSpec(version=1, max_beyond_measured=0.1)
+    codes = (0, EXIT_CODES["regression"], EXIT_CODES["incomplete"])
+    assert judged(with_beyond(shares), spec).exit_code == codes[wanted]
+    assert judged(rows(), spec).exit_code == codes[2], "a run without the metric is no pass"
+    rule = {"beyond_measured_share": MetricRule(max=0.1)}
+    for fields in ({"metrics": rule}, {"boundary_margin": 0.1}):
+        with pytest.raises(ValueError, match="max_beyond_measured"):
+            GateSpec(version=1, max_beyond_measured=0.1, **fields)
+
+
 def test_a_gate_of_limits_names_a_new_collision_where_there_is_a_baseline():
     stored = rows()
     collided = add(1.0, "collision_any", ONE)(rows())
