@@ -29,6 +29,7 @@ from alpasim_plugin.core.types import (
     Degradation,
     Environment,
     Latency,
+    PlanRange,
     Rates,
     Route,
     Scenario,
@@ -42,7 +43,7 @@ from scenarios.cameras import camera_spec, check_mounts, given_cameras
 from scenarios.map_lines import alpasim_view
 from scenarios.measured import measured_range
 from scenarios.recorded import RecordedLog
-from scenarios.schema import VehicleSpec
+from scenarios.schema import ScenarioSpec, VehicleSpec
 from scenarios.sources import open_document, recorded_drive, source_digest
 from scenarios.suite import ScenarioRef, find
 from scenarios.variation import SceneDraft, draw
@@ -99,7 +100,12 @@ def _loaded(draft: SceneDraft, source: str | None, inputs: Inputs) -> Scenario:
     for path in scenario.shown_files:
         content_of(path)
     inputs.setting("scene", scenario.content_hash)
-    scenario = replace(scenario, content_hash=inputs.key, files=inputs.files)
+    scenario = replace(
+        scenario,
+        content_hash=_with_ranges(inputs.key, draft.spec),
+        files=inputs.files,
+        plan_ranges=_plan_ranges(draft.spec, inputs.key),
+    )
     if cameras is not None:
         check_mounts(draft, cameras, scenario.vehicle)
     check_scenario(scenario, draft.document.path)
@@ -352,8 +358,8 @@ def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
     """Hash the resolved specification, the scene id (it keys the random streams) and the bytes of
     every data file.
 
-    Words for people, the places where data files lie, and where a rollout ends do not matter: they
-    do not change the scene.
+    Words for people, the places where data files lie, where a rollout ends and up to where plans
+    are near do not matter: they do not change the scene.
     """
     spec = draft.spec
     content = spec.model_dump(
@@ -362,6 +368,7 @@ def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
             "description": True,
             "tags": True,
             "catches": True,
+            "plan_ranges": True,
             "timing": {"stop_at_path_end"},
         },
     )
@@ -388,6 +395,27 @@ def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
         file = draft.document.folder_of(("background", "file")) / spec.background.file
         scene.update(bytes.fromhex(file_sha256(file)))
     return scene.hexdigest()
+
+
+def _plan_ranges(spec: ScenarioSpec, content_hash: str) -> tuple[PlanRange, ...]:
+    """Return up to where plans are near, and whether that was looked for on this scene."""
+    return tuple(
+        PlanRange(
+            entry.renderer,
+            entry.policy,
+            entry.near_to_m,
+            is_current=content_hash.startswith(entry.scene.removeprefix("sha256-")),
+        )
+        for entry in spec.plan_ranges
+    )
+
+
+def _with_ranges(content_hash: str, spec: ScenarioSpec) -> str:
+    """Return the digest of a scene with its ranges, on which the scores of a rollout depend."""
+    if not spec.plan_ranges:
+        return content_hash
+    ranges = [entry.model_dump(mode="json") for entry in spec.plan_ranges]
+    return hashlib.sha256(json.dumps([content_hash, ranges]).encode()).hexdigest()
 
 
 def _drop(content: dict[str, Any], keys: Sequence[str]) -> None:

@@ -9,13 +9,16 @@ from alpasim_plugin.core.geometry import interpolate, wrap_angle
 from alpasim_plugin.core.types import F64, CameraSpec, MeasuredRange, Photograph
 from scenarios.recorded import RecordedLog
 
+MOST_TURN_DEG = 20.0  # between cameras that show nearly the same
+
 
 def measured_range(drive: RecordedLog, cameras: Sequence[CameraSpec]) -> MeasuredRange | None:
     """Return the range of an imported drive; None where nothing is reconstructed.
 
     Photographs along the path that were held out compare it at a distance of 0; those of a camera
     that no fit saw at that camera's distance from the path of the fitted photographs, the median of
-    its photographs.
+    its photographs. A camera that looks aside compares no view ahead, so that it says nothing of the
+    distance.
 
     Args:
         drive: The drive.
@@ -31,13 +34,14 @@ def measured_range(drive: RecordedLog, cameras: Sequence[CameraSpec]) -> Measure
     cameras_beside = _by_camera(
         [photograph for photograph in unseen if photograph.use == "never-fitted"]
     )
-    lateral_m = [
-        float(np.median(shapely.distance(paths, shapely.points(_places(photographs)))))
-        for photographs in cameras_beside
-    ]
     turn_deg = [
         float(np.median([_turn_deg(drive, cameras[0], photograph) for photograph in photographs]))
         for photographs in cameras_beside
+    ]
+    lateral_m = [
+        float(np.median(shapely.distance(paths, shapely.points(_places(photographs)))))
+        for photographs, turned_deg in zip(cameras_beside, turn_deg, strict=True)
+        if turned_deg <= MOST_TURN_DEG
     ]
     return MeasuredRange(
         round(max(lateral_m, default=0.0), 3), round(max(turn_deg, default=0.0), 1), len(unseen)

@@ -20,6 +20,7 @@ from scenarios.schema_parts import (
     MapRoute,
     MapSpec,
     Part,
+    PlanRangeSpec,
     RoadSpec,
     field,
     number,
@@ -418,6 +419,11 @@ class ScenarioSpec(Part):
     degradation: DegradationSpec = field("Degradation of the renderer 3dgs.", DegradationSpec())
     background: BackgroundSpec | None = field("A Gaussian file as background.", None)
     vehicle: VehicleSpec | None = field("The ego; none: the log's, or the default one.", None)
+    plan_ranges: tuple[PlanRangeSpec, ...] = Field(
+        default=(),
+        max_length=int(b.LISTED.high),
+        description="Of a built scene: up to where plans are near those behind clean (simrun bench real --range).",
+    )
     jitter: JitterSpec = field("How other scene seeds than 0 differ.", JitterSpec())
     variations: dict[str, RangeSpec | ChoiceSpec] = field(
         "Dotted key to {low, high} or {choice: [...]}, drawn with the scene seed.", {}
@@ -440,7 +446,16 @@ class ScenarioSpec(Part):
             for name in ("lane", "start_m", "lane_changes"):
                 if getattr(self.ego, name) != getattr(plain, name):
                     raise ValueError(f"ego.{name} with map | give map.route, and remove ego.{name}")
+        pairs = [(entry.renderer, entry.policy) for entry in self.plan_ranges]
+        if len(set(pairs)) < len(pairs):
+            raise ValueError(
+                "plan_ranges name a renderer with a policy twice | keep one entry of each pair"
+            )
         if self.log is not None and self.log.drive is not None:
+            if self.plan_ranges:
+                raise ValueError(
+                    "plan_ranges with log.drive, whose photographs say how far it was compared | remove plan_ranges"
+                )
             built = {
                 "degradation": self.degradation,
                 "background": self.background,

@@ -207,6 +207,20 @@ class LogSpec(Part):
         return kind, str(getattr(self, kind)), kind
 
 
+class PlanRangeSpec(Part):
+    """How far beside the recorded path plans behind a renderer are near those behind clean."""
+
+    renderer: str = Field(min_length=1, description="Renderer, as a run names it.")
+    policy: str = Field(min_length=1, description="Policy, as a run names it.")
+    near_to_m: float | None = Field(
+        ge=0, le=10, description="To either side of the path; null: not even on the path."
+    )
+    scene: str = Field(
+        pattern=r"^sha256-[0-9a-f]{16}$",
+        description="Digest of the scene on which it was looked for.",
+    )
+
+
 Place = Annotated[str, Field(pattern=r"^.+:\d+(\.\d+)?$")]
 
 

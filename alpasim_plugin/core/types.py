@@ -524,6 +524,18 @@ class MeasuredRange:
 
 
 @dataclass(frozen=True)
+class PlanRange:
+    """How far beside the recorded path of a built scene the plans that a policy makes behind a renderer
+    are near those that it makes behind `clean`.
+    """
+
+    renderer: str  # its name, as a run has it
+    policy: str  # its name, as a run has it
+    near_to_m: float | None  # to either side; None: not even on the path
+    is_current: bool = True  # whether it was looked for on the scene as it is now
+
+
+@dataclass(frozen=True)
 class Scene:
     """What evaluators may see of a scenario: the map and the human drive, never pixels."""
 
@@ -538,6 +550,7 @@ class Scene:
     path_beyond: F64 = field(default_factory=lambda: np.zeros((0, 3)))
     path_end: PathEndKind = "record"  # what the end of the path is
     measured: MeasuredRange | None = None  # of a reconstructed drive; None: the scene is built
+    plan_ranges: tuple[PlanRange, ...] = ()  # of a built scene, where they were looked for
 
 
 @dataclass(frozen=True)
@@ -584,6 +597,7 @@ class Scenario:
     # how far ahead of the ego the points of `Observation.route_rig` begin
     route_offset_m: float = 0.0
     measured: MeasuredRange | None = None  # of a reconstructed drive; None: the scene is built
+    plan_ranges: tuple[PlanRange, ...] = ()  # of a built scene, where they were looked for
     # what the loader read beside the scenario file: path -> digest of the content
     files: Mapping[str, str] = field(default_factory=dict)
 
@@ -624,6 +638,7 @@ class Scenario:
             self.path_beyond,
             self.path_end,
             self.measured,
+            self.plan_ranges,
         )
 
 

@@ -1,14 +1,24 @@
-"""Whether a drive through a reconstruction stays where its renders were compared with photographs.
+"""Whether a drive stays where what its renderer shows was compared with the truth.
 
 The nearer to the recorded path, the more a reconstruction shows what was there. How near a renderer
 comes to photographs is known on that path, and as far beside it as a camera that no fit saw was
-mounted (`simrun bench real`); farther away nobody has looked.
+mounted (`simrun bench real`); farther away nobody has looked. On a built scene the truth is what
+`clean` shows, and its file may say how far beside the path the policy's plans behind a renderer are
+near those behind `clean` (`simrun bench real --range`).
 """
 
 import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, wrap_angle, yaw_from_quat
-from alpasim_plugin.core.types import F64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    Bool,
+    MetricSeries,
+    PlanRange,
+    RolloutLog,
+    Scene,
+    Trajectory,
+)
 from evaluators.metrics.footprint import ego_footprints, origin_of
 from evaluators.metrics.presets import Preset
 from evaluators.metrics.route import recorded_path, to_path
@@ -17,29 +27,69 @@ from evaluators.metrics.score import series, with_preset
 BEYOND = "beyond_measured_share"
 ON_PATH_M = 0.25  # nearer than this counts as on the path
 SAME_TURN_DEG = 5.0  # a view that is turned by less shows nearly the same
+TRUTH = "clean"  # of a built scene
+NOT_LOOKED_FOR = (
+    "how far beside the path plans are near was not looked for with this renderer and policy"
+)
+OTHER_SCENE = "the scene is another one than that on which the range of its plans was looked for"
 
 
 def evaluate_measured(
     rollout: RolloutLog, scene: Scene | None, preset: Preset
 ) -> list[MetricSeries]:
     """Give ``beyond_measured_share``: 1 at a step that lies beyond what was compared, by place or by
-    heading. Built scenes have none, and presets that copy AlpaSim's tables neither.
+    heading. Built scenes without a range have none, and presets that copy AlpaSim's tables neither.
     """
-    if scene is None or scene.measured is None or preset.aliases:
+    if scene is None or preset.aliases:
         return []
+    if scene.measured is not None:
+        measured = scene.measured
+        if not measured.n_photographs:
+            return [series(BEYOND, rollout.ego.t_us, 1.0)]
+        limits = (measured.lateral_m, measured.turn_deg)
+        return [series(BEYOND, rollout.ego.t_us, _is_beyond(rollout, preset, *limits))]
+    if not scene.plan_ranges:
+        return []
+    renderer, policy = _variant(rollout)
+    if renderer == TRUTH:
+        return [series(BEYOND, rollout.ego.t_us, 0.0)]
+    entry = _range_of(scene.plan_ranges, renderer, policy)
+    if entry is None or not entry.is_current:
+        reason = NOT_LOOKED_FOR if entry is None else OTHER_SCENE
+        return [series(BEYOND, rollout.ego.t_us, np.nan, False, reason)]
+    if entry.near_to_m is None:
+        return [series(BEYOND, rollout.ego.t_us, 1.0)]
+    return [series(BEYOND, rollout.ego.t_us, _is_beyond(rollout, preset, entry.near_to_m, 0.0))]
+
+
+def _is_beyond(rollout: RolloutLog, preset: Preset, lateral_m: float, turn_deg: float) -> Bool:
+    """Return for each pose of the ego ``(T,)`` whether it lies farther from the recorded path, or is
+    turned farther from it, than what was compared.
+    """
     path = recorded_path(rollout, preset)
     origin = origin_of(rollout.ego_log, preset)
     ego = ego_footprints(rollout, preset, origin).centres()
     line = path.xyz[:, :2] - origin[:2]
     distance_m, along_m = to_path(line, ego)
-    turn_deg = _turns_deg(path, line, along_m, rollout.ego)
-    measured = scene.measured
-    is_beyond: Bool = np.ones(len(ego), dtype=np.bool_)
-    if measured.n_photographs:
-        is_beyond = (distance_m > max(measured.lateral_m, ON_PATH_M)) | (
-            turn_deg > max(measured.turn_deg, SAME_TURN_DEG)
-        )
-    return [series(BEYOND, rollout.ego.t_us, is_beyond)]
+    turns_deg = _turns_deg(path, line, along_m, rollout.ego)
+    is_far: Bool = distance_m > max(lateral_m, ON_PATH_M)
+    return is_far | (turns_deg > max(turn_deg, SAME_TURN_DEG))
+
+
+def _variant(rollout: RolloutLog) -> tuple[str, str]:
+    """Return the names of renderer and policy of a log, empty where it does not say them; a log has
+    the weights of a fixer in brackets behind its name.
+    """
+    versions = rollout.info.get("versions", {})
+    return versions.get("sensorsim", "").split(" (")[0], versions.get("egodriver", "")
+
+
+def _range_of(ranges: tuple[PlanRange, ...], renderer: str, policy: str) -> PlanRange | None:
+    """Return the range of a renderer and a policy; None where none was looked for."""
+    for entry in ranges:
+        if (entry.renderer, entry.policy) == (renderer, policy):
+            return entry
+    return None
 
 
 def _turns_deg(path: Trajectory, line: F64, along_m: F64, ego: Trajectory) -> F64:

@@ -55,6 +55,6 @@ PARTS = (
         kind="evaluator",
         name="measured",
         target="evaluators.metrics.measured:FACTORY",
-        help="steps of a reconstructed drive beyond where renders were compared with photographs",
+        help="steps beyond where what a renderer shows was compared with the truth",
     ),
 )

@@ -574,13 +574,13 @@ METRICS = MetricTable(
             "",
             "lower",
             "mean",
-            "share of the steps that lie farther from the recorded path, or are turned farther from it, than any photograph with which the reconstruction was compared",
+            "share of the steps that lie farther from the recorded path, or are turned farther from it, than what the renderer shows was compared with the truth",
             is_share=True,
             label="steps beyond what was compared",
             margin=0.05,
             reference=CENTRE,
-            invalid="the scene is built; then there is no row",
-            formula="1 where `c` is farther from `P` than the farthest camera whose photographs no fit saw (at least 0.25 m), or the heading differs by more than its axis does (at least 5 degrees)",
+            invalid="the scene is built, and its `plan_ranges` do not name the renderer and the policy or are of another scene; without `plan_ranges` there is no row",
+            formula="1 where `c` is farther from `P` than the farthest camera whose photographs no fit saw, of a built scene than its `plan_ranges` say (at least 0.25 m), or the heading differs by more than that camera's axis does (at least 5 degrees)",
         ),
         "safety_monitor_triggered": _flag(
             "the policy's own safety monitor fired", direction="none", formula="0; `alpasim` only"

@@ -331,7 +331,7 @@ def overview_of(run: Run) -> Overview:
         parts.append(f"renderer {run.renderers[0]}")
     cautions = [
         *fixer_cautions(summary),
-        *measured_cautions(summary),
+        *measured_cautions(run),
         *policy_cautions(run),
         *drive_call_lines(run, late=True),
         *unlit_lines(run),

@@ -165,31 +165,40 @@ def cause_of(
     made_up = "" if failed_us is None else seen_before(frame_rows, failed_us)
     sentences += [f"{made_up}."] if made_up else []
     if failed_us is not None and BEYOND in run.table and rollout.ok:
-        sentences += beyond_sentences(run.steps_of(rollout), failed_us)
+        reason = beyond_reason(run.scene_data(rollout.scene))
+        sentences += beyond_sentences(run.steps_of(rollout), failed_us, reason)
     ended = None if manifest is None else manifest.ended
     if rollout.ok and ended in ENDED:
         sentences.append(f"The rollout ended since {ENDED[ended]}.")
     return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log, failure)
 
 
-def beyond_sentences(steps: pa.Table, failed_us: int) -> list[str]:
-    """Say since when, before a failure, the ego drove where no render was compared with a photograph;
-    nothing where it did not at the failure.
+def beyond_reason(scene: JsonView | None) -> str:
+    """Say what is not known beyond the range of a scene, whose file is given where there is one."""
+    if scene is not None and scene.get("plan_ranges"):
+        return "where its plans are not known to be near those behind clean"
+    return "where nothing was compared with a photograph"
+
+
+def beyond_sentences(steps: pa.Table, failed_us: int, reason: str) -> list[str]:
+    """Say since when, before a failure, the ego drove beyond the range of the scene, or that this is
+    not known; nothing where it did not at the failure.
 
     Args:
         steps: Of the rollout, as `Run.steps_of` reads them.
         failed_us: When it failed.
+        reason: Of `beyond_reason`.
     """
-    keep = (pc.field("metric") == BEYOND) & pc.field("valid") & (pc.field("t_us") <= failed_us)
+    keep = (pc.field("metric") == BEYOND) & (pc.field("t_us") <= failed_us)
     rows = steps.filter(keep).sort_by("t_us")
     flags = rows["value"].to_pylist()
+    if flags and not rows["valid"][-1].as_py():
+        return [f"Whether it can be trusted there is not known: {rows['reason'][-1].as_py()}."]
     if not flags or not flags[-1]:
         return []
     since = len(flags) - [*flags[::-1], 0.0].index(0.0)
     since_s = (failed_us - rows["t_us"][since].as_py()) * 1e-6
-    return [
-        f"For the last {since_s:.1f} s before the failure it drove where no render was compared with a photograph."
-    ]
+    return [f"For the last {since_s:.1f} s before the failure it drove {reason}."]
 
 
 def _measured(

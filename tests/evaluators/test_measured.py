@@ -1,15 +1,16 @@
 """The steps of a drive through a reconstruction that lie beyond what was compared with photographs."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from alpasim_plugin.core.types import MeasuredRange
+from alpasim_plugin.core.types import MeasuredRange, PlanRange
+from evaluators.metrics.measured import NOT_LOOKED_FOR, OTHER_SCENE
 from evaluators.metrics.score import score
 from evaluators.pages.measured import measured_cautions
-from evaluators.results import Failures, Mean, Summary
 from evaluators.statistics.cause import beyond_sentences
 from tests.evaluators.eval_build import TWO_LANES, by_name, rollout, scene, track
 
@@ -75,31 +76,105 @@ def test_a_recording_that_stands_in_between_has_one_heading_there():
     assert by_name(score(log, where))[NAME].value.tolist() == [0.0] * 7
 
 
-def summary_of(share):
-    mean = Mean(
-        mean=share,
-        ci95=None,
-        ci95_clustered=None,
-        n_rollouts=3,
-        n_scenes=3,
-        unit="",
-        direction="lower",
+def looked_for(near_to_m, **others):
+    return PlanRange("onefixer", "p", near_to_m, **others)
+
+
+def on_built(ego, entry, renderer="onefixer (trained, 1a2b)", preset="strict"):
+    log = replace(
+        rollout(ego, log=PATH), info={"versions": {"sensorsim": renderer, "egodriver": "p"}}
     )
-    return Summary("strict", {"3dgs": {NAME: mean}}, {}, {}, {}, Failures(3, 0, {}))
+    where = replace(scene(TWO_LANES, log), plan_ranges=(entry,))
+    return by_name(score(log, where, preset)).get(NAME)
 
 
 @pytest.mark.parametrize(
-    ("share", "text"),
-    [(0.31, "3dgs: 31 % of its steps"), (0.002, "3dgs: less than 1 % of its steps")],
+    ("near_to_m", "aside_m", "is_beyond"),
+    [(0.5, 0.4, 0.0), (0.5, -0.6, 1.0), (0.0, 0.2, 0.0), (None, 0.0, 1.0)],
 )
-def test_the_first_screen_says_the_share(share, text):
-    (caution,) = measured_cautions(summary_of(share))
-    assert caution.startswith(text)
+def test_a_built_scene_is_compared_up_to_where_plans_are_near(near_to_m, aside_m, is_beyond):
+    series = on_built(track(np.arange(11.0), aside_m), looked_for(near_to_m))
+    assert series.value.tolist() == [is_beyond] * 11
+
+
+def test_what_clean_shows_of_a_built_scene_is_the_truth_everywhere():
+    ego = track(np.arange(11.0), 3.0)
+    assert on_built(ego, looked_for(0.5), "clean").value.tolist() == [0.0] * 11
+
+
+@pytest.mark.parametrize(
+    ("entry", "renderer", "reason"),
+    [
+        (looked_for(0.5), "3dgs", NOT_LOOKED_FOR),
+        (looked_for(0.5), "onefixer[references=0] (trained)", NOT_LOOKED_FOR),
+        (looked_for(0.5, is_current=False), "onefixer", OTHER_SCENE),
+    ],
+)
+def test_a_range_that_is_not_known_is_no_zero(entry, renderer, reason):
+    series = on_built(PATH, entry, renderer)
+    assert not series.valid.any()
+    assert np.isnan(series.value).all()
+    assert series.reason == reason
+
+
+def test_a_log_that_does_not_name_its_renderer_has_no_range():
+    log = rollout(PATH, log=PATH)
+    where = replace(scene(TWO_LANES, log), plan_ranges=(looked_for(0.5),))
+    assert by_name(score(log, where))[NAME].reason == NOT_LOOKED_FOR
+
+
+def run_of(share, scenes, reasons=()):
+    mean = SimpleNamespace(mean=share)
+    invalid = {NAME: SimpleNamespace(reasons=dict(reasons))}
+    summary = SimpleNamespace(
+        metrics={"3dgs": {NAME: mean}}, censoring={"3dgs": SimpleNamespace(invalid=invalid)}
+    )
+    rollouts = [
+        SimpleNamespace(scene=name, renderer="3dgs", policy="p", metrics={NAME: share})
+        for name in scenes
+    ]
+    return SimpleNamespace(
+        summary=summary, rollouts_of=lambda variant: rollouts, scene_data=scenes.get
+    )
+
+
+def photographed(lateral_m, n_photographs=9):
+    measured = {"lateral_m": lateral_m, "turn_deg": 0.0, "n_photographs": n_photographs}
+    return {"measured": measured, "plan_ranges": []}
+
+
+def built(near_to_m):
+    entry = {"renderer": "3dgs", "policy": "p", "near_to_m": near_to_m}
+    return {"measured": None, "plan_ranges": [entry]}
+
+
+@pytest.mark.parametrize(
+    ("share", "scenes", "text"),
+    [
+        (0.31, {"a": photographed(0.6)}, "3dgs: 31 % of its steps lie beyond 0.6 m beside"),
+        (0.002, {"a": photographed(0.0)}, "3dgs: less than 1 % of its steps lie beyond 0.25 m"),
+        (1.0, {"a": photographed(0.0, 0)}, "3dgs: 100 % of its steps lie beyond 0 m beside"),
+        (0.5, {"a": photographed(0.54), "b": photographed(1.2)}, "lie beyond 0.54 to 1.2 m beside"),
+        (0.5, {"a": built(0.75)}, "lie beyond 0.75 m beside"),
+        (0.5, {"a": None}, "lie too far beside the recorded path"),
+    ],
+)
+def test_the_first_screen_says_the_share_and_the_distance(share, scenes, text):
+    (caution,) = measured_cautions(run_of(share, scenes))
+    assert text in caution
+    is_built = any(content and content["plan_ranges"] for content in scenes.values())
+    assert ("near those behind clean" in caution) is is_built
+
+
+def test_the_first_screen_says_what_is_not_known():
+    reasons = {OTHER_SCENE: 2, "no row": 1}
+    (caution,) = measured_cautions(run_of(None, {"a": built(0.5)}, reasons))
+    assert caution.startswith("3dgs, 2\u00a0rollouts: the scene is another one")
 
 
 @pytest.mark.parametrize("share", [0.0, None])
 def test_the_first_screen_says_nothing_where_nothing_is_beyond(share):
-    assert measured_cautions(summary_of(share)) == []
+    assert measured_cautions(run_of(share, {"a": photographed(0.6)})) == []
 
 
 def steps(flags):
@@ -108,9 +183,10 @@ def steps(flags):
         "metric": [NAME] * len(flags),
         "t_us": t_us,
         "value": flags,
-        "valid": [True] * len(flags),
+        "valid": [flag is not None for flag in flags],
+        "reason": ["" if flag is not None else "not looked for" for flag in flags],
     }
-    others = {"metric": ["progress"], "t_us": [0], "value": [1.0], "valid": [True]}
+    others = {"metric": ["progress"], "t_us": [0], "value": [1.0], "valid": [True], "reason": [""]}
     other_rows = pa.table(others)
     return pa.concat_tables([other_rows, pa.table(columns, schema=other_rows.schema)])
 
@@ -124,10 +200,15 @@ def steps(flags):
     ],
 )
 def test_a_cause_says_since_when_nothing_was_compared(flags, failed_us, since_s):
-    (sentence,) = beyond_sentences(steps(flags), failed_us)
+    (sentence,) = beyond_sentences(steps(flags), failed_us, "where nothing was")
     assert f"the last {since_s} s before" in sentence
 
 
 def test_a_cause_says_nothing_where_the_failure_lies_within():
-    assert beyond_sentences(steps([1.0, 1.0, 0.0]), 250_000) == []
-    assert beyond_sentences(steps([]), 250_000) == []
+    assert beyond_sentences(steps([1.0, 1.0, 0.0]), 250_000, "") == []
+    assert beyond_sentences(steps([]), 250_000, "") == []
+
+
+def test_a_cause_says_where_the_range_is_not_known():
+    (sentence,) = beyond_sentences(steps([None, None]), 250_000, "")
+    assert "not known: not looked for" in sentence

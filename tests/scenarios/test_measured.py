@@ -39,7 +39,9 @@ def test_a_camera_that_looks_aside_compares_turned(drive):
         else photograph
         for photograph in drive.recording
     )
-    assert range_of(drive, turned).turn_deg == pytest.approx(90.0)
+    measured = range_of(drive, turned)
+    assert measured.turn_deg == pytest.approx(90.0)
+    assert measured.lateral_m == 0.0, "it compares no view ahead from beside the path"
 
 
 def test_nothing_was_compared_without_photographs_that_no_fit_saw(drive):

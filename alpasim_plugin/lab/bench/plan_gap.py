@@ -23,6 +23,7 @@ BRAKES_MPS = 0.5  # by which a plan that brakes is slower, one second ahead, tha
 BLOCK_S = 4.0  # plans overlap within it, so that what varies is a block of so long
 GAPS = tuple(f"{side}_{horizon_s}s_m" for horizon_s in HORIZONS_S for side in ("lateral", "along"))
 RANGE_STEP_M = 0.25  # between offsets at which the range of a built scene is looked for
+RANGE_KEYS = ("drive", "policy", "renderer")
 NEAR_M = 0.3  # across the plan, two seconds ahead
 BIN_M = (0.25, 0.75, 1.5, 3.0)  # rows end at these distances from the recorded path
 
@@ -232,27 +233,29 @@ def is_near(row: Row) -> bool:
 def gap_ranges(rows: Sequence[Row]) -> list[Row]:
     """Return how far beside the path of a built scene plans are near, by drive, policy and renderer.
 
-    ``near_to_m`` is the largest offset up to which all offsets that were looked at are near; None
-    where those on the path are not. ``passes_at_m`` is the next one; None where none passes.
+    ``near_to_m`` is the largest distance up to which all offsets that were looked at, to either side,
+    are near; None where those on the path are not. ``passes_at_m`` is the next one; None where none
+    passes.
 
     Args:
-        rows: Of `gap_rows`, with their offsets from 0 up in ``offset_m``.
+        rows: Of `gap_rows`, with their offsets, from 0 up and down, in ``offset_m``.
     """
-    keys = ("drive", "policy", "renderer")
     out = []
-    for key in dict.fromkeys(tuple(row[name] for name in keys) for row in rows):
+    for key in dict.fromkeys(tuple(row[name] for name in RANGE_KEYS) for row in rows):
+        is_near_at: dict[float, bool] = {}
+        for row in rows:
+            if tuple(row[name] for name in RANGE_KEYS) == key:
+                distance_m = abs(row["offset_m"])
+                is_near_at[distance_m] = is_near_at.get(distance_m, True) and is_near(row)
         near_to_m = None
         passes_at_m = None
-        for row in sorted(
-            (row for row in rows if tuple(row[name] for name in keys) == key),
-            key=lambda row: row["offset_m"],
-        ):
-            if not is_near(row):
-                passes_at_m = row["offset_m"]
+        for distance_m in sorted(is_near_at):
+            if not is_near_at[distance_m]:
+                passes_at_m = distance_m
                 break
-            near_to_m = row["offset_m"]
+            near_to_m = distance_m
         values = {"near_to_m": near_to_m, "passes_at_m": passes_at_m}
-        out.append({**dict(zip(keys, key, strict=True)), **values})
+        out.append({**dict(zip(RANGE_KEYS, key, strict=True)), **values})
     return out
 
 

@@ -31,7 +31,6 @@ from alpasim_plugin.lab.bench.plan_gap import (
     gap_intervals,
     gap_ranges,
     gap_rows,
-    is_near,
 )
 from alpasim_plugin.lab.bench.real import (
     Judges,
@@ -45,6 +44,7 @@ from alpasim_plugin.lab.bench.real import (
     unseen_cameras,
 )
 from alpasim_plugin.lab.cli.bench_rows import print_rows
+from alpasim_plugin.lab.cli.range_file import check_target, write_ranges
 from alpasim_plugin.lab.video_metrics.image_distance import load_distance
 from alpasim_plugin.lab.video_metrics.perceptual_net import NAME
 from alpasim_plugin.runs.renderer import make_renderer
@@ -61,7 +61,7 @@ Examples:
 
 - `simrun bench real hard/sharp_s_curve --policy learned --offsets 0,0.5,1`: in a built scene, beside its path
 
-- `simrun bench real hard/sharp_s_curve --policy learned --range`: how far beside it plans stay near
+- `simrun bench real hard/sharp_s_curve --policy learned --range -o street.yaml`: how far beside it plans stay near, and a scene on which runs count the steps beyond
 """
 EVERY = 10  # frames between lines of progress
 MOST_OFFSET_M = 10.0
@@ -99,9 +99,18 @@ def real(
         bool,
         typer.Option(
             "--range",
-            help="Of built scenes: offsets of 0.25 m, up to where the plans' gap passes 0.3 m after two seconds.",
+            help="Of built scenes: offsets of 0.25 m to both sides, up to where the plans' gap passes 0.3 m after two seconds.",
         ),
     ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE.yaml",
+            help="With --range: write the scene with its range; a run on it counts the steps beyond.",
+        ),
+    ] = None,
     seed: Annotated[
         int, typer.Option("--seed", min=0, help="Seed of the noise of fixers and policies.")
     ] = 0,
@@ -137,6 +146,8 @@ def real(
     scenarios = _loaded(drives)
     built = {name: drive for name, drive in scenarios.items() if drive.model is None}
     offsets_m = _offsets(offsets, find_range)
+    if out is not None:
+        check_target(out, drives, find_range)
     offset_option = "--range" if find_range else f"--offsets {offsets}" if offsets else ""
     _refuse_mixtures(scenarios, built, bench.policies, offset_option)
     recorded = {name: drive for name, drive in scenarios.items() if name not in built}
@@ -148,6 +159,9 @@ def real(
     for name, scenario in built.items():
         gaps += bench.measure_built(name, scenario, offsets_m)
     ranges = gap_ranges(gaps) if find_range else []
+    if out is not None:
+        write_ranges(out, drives[0], built[next(iter(built))], ranges, gaps)
+        console.print(f"wrote {out}", highlight=False)
     _say(images, gaps, ranges, len(scenarios), as_json, console)
 
 
@@ -211,11 +225,19 @@ class _Bench:
         """
         rows: list[dict[str, Any]] = []
         for offset_m in offsets.metres:
-            rows_here = self._at_offset(name, scenario, offset_m)
-            rows += [{**row, "offset_m": offset_m} for row in rows_here]
-            if offsets.is_range and not any(is_near(row) for row in rows_here):
+            rows_here = self._with_offset(name, scenario, offset_m)
+            if offsets.is_range and offset_m:
+                rows_here += self._with_offset(name, scenario, -offset_m)
+            rows += rows_here
+            if offsets.is_range and not any(
+                row["passes_at_m"] is None for row in gap_ranges(rows_here)
+            ):
                 break
         return rows
+
+    def _with_offset(self, name: str, scenario: Scenario, offset_m: float) -> list[dict[str, Any]]:
+        rows = self._at_offset(name, scenario, offset_m)
+        return [{**row, "offset_m": offset_m} for row in rows]
 
     def _at_offset(self, name: str, scenario: Scenario, offset_m: float) -> list[dict[str, Any]]:
         cameras = {policy.name: _cameras_of(policy, scenario) for policy in self.policies}
@@ -408,7 +430,8 @@ def _loaded(drives: Sequence[Path]) -> dict[str, Scenario]:
     for drive in drives:
         imported = drive / "scenario.yaml"
         file = imported if imported.is_file() else drive
-        scenario = load_scenario(str(file))
+        # Ranges of plans that its file states change nothing of what is looked at.
+        scenario = load_scenario(str(file), overrides=["plan_ranges=[]"])
         name = scenario.scene_id if scenario.model is None else file.parent.name
         if name in out:
             raise InputError(

@@ -257,6 +257,8 @@ def scene_as_json(scenario: Scenario | LoggedScene) -> JsonObject:
         "crosswalks": [_xy(ring) for ring in scene.lane_map.crosswalks],
         "ego_log": {"t_us": log.t_us[keep].tolist()}
         | {f"{axis}_m": np.round(log.xyz[keep, i], 3).tolist() for i, axis in enumerate("xy")},
+        "measured": None if scene.measured is None else vars(scene.measured),
+        "plan_ranges": [vars(entry) for entry in scene.plan_ranges],
         "vehicle": {
             "length_m": scene.vehicle.box.length_m,
             "width_m": scene.vehicle.box.width_m,

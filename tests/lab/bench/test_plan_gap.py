@@ -4,6 +4,7 @@ frame, and what is refused.
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import resolve
-from alpasim_plugin.core.types import CameraSpec, Plan, SensorSpec
+from alpasim_plugin.core.types import CameraSpec, Plan, PlanRange, SensorSpec
 from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
 from alpasim_plugin.lab.bench.open_loop import TrueImage, plans_of, roles_of
 from alpasim_plugin.lab.bench.plan_gap import (
@@ -29,6 +30,8 @@ from alpasim_plugin.lab.bench.plan_gap import (
 )
 from alpasim_plugin.lab.bench.real import series_of, shots_of
 from alpasim_plugin.lab.cli import bench_real
+from alpasim_plugin.lab.cli.range_file import check_target, write_ranges
+from scenarios.load import load_scenario
 from tests.renderers.recorded_drive import recorded_drive
 
 HERE = "tests.lab.bench.test_plan_gap"
@@ -353,6 +356,37 @@ def test_a_range_may_not_begin_and_may_not_end(gaps_m, near_to_m, passes_at_m):
     assert not is_near(offset_row(0.0, None))
 
 
+def test_a_range_ends_where_plans_on_one_side_are_not_near():
+    rows = [offset_row(0.0, 0.1), offset_row(0.25, 0.1), offset_row(-0.25, 0.4)]
+    (row,) = gap_ranges(rows)
+    assert (row["near_to_m"], row["passes_at_m"]) == (0.0, 0.25)
+
+
+def test_a_range_is_written_into_a_scene_and_holds_for_this_scene_alone(tmp_path):
+    scene = Path("smoke/curve")
+    scenario = load_scenario(str(scene))
+    out = tmp_path / "street.yaml"
+    ranges = [{"renderer": "3dgs", "policy": "p", "near_to_m": near} for near in (0.5,)]
+    write_ranges(out, scene, scenario, ranges, [])
+    written = load_scenario(str(out))
+    assert written.scene_id == scenario.scene_id
+    assert written.scene.plan_ranges == (PlanRange("3dgs", "p", 0.5, is_current=True),)
+    assert written.content_hash != scenario.content_hash, "scores of before are not taken for its"
+    (other,) = load_scenario(str(out), overrides=["degradation.share=0.07"]).plan_ranges
+    assert not other.is_current
+    with pytest.raises(InputError, match="end before two seconds"):
+        write_ranges(tmp_path / "b.yaml", scene, scenario, ranges, [offset_row(0.0, None)])
+    for arguments in ((out, [scene], True), (tmp_path / "c.yaml", [scene], False)):
+        with pytest.raises(InputError):
+            check_target(*arguments)
+
+
+def test_a_range_of_a_pair_is_given_once(tmp_path):
+    entry = "{renderer: 3dgs, policy: p, near_to_m: 0.5, scene: sha256-0123456789012345}"
+    with pytest.raises(InputError, match="twice"):
+        load_scenario("smoke/curve", overrides=[f"plan_ranges=[{entry}, {entry}]"])
+
+
 def test_every_drive_and_renderer_has_a_range_of_its_own():
     rows = [offset_row(0.0, 0.1), offset_row(0.0, 0.4, "onefixer"), offset_row(0.0, 0.4, drive="e")]
     assert [row["near_to_m"] for row in gap_ranges(rows)] == [0.0, None, None]
@@ -365,12 +399,13 @@ def test_a_range_is_looked_for_until_no_renderer_is_near(drive, monkeypatch, cap
 
     def rows_at(bench, name, scenario, offset_m):
         looked_at.append(offset_m)
-        return [offset_row(offset_m, 0.2 + offset_m), offset_row(offset_m, 0.39 * offset_m, "x")]
+        beside_m = abs(offset_m)
+        return [offset_row(offset_m, 0.2 + beside_m), offset_row(offset_m, 0.39 * beside_m, "x")]
 
     monkeypatch.setattr(bench_real._Bench, "_at_offset", rows_at)
     command = ["bench", "real", "d", "--renderer", "3dgs", "--policy", f"{HERE}:Steers"]
     assert run_command([*command, "--range", "--json"]) == 0
-    assert looked_at == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert looked_at == [0.0, 0.25, -0.25, 0.5, -0.5, 0.75, -0.75, 1.0, -1.0]
     ranges = json.loads(capsys.readouterr().out)["plan_gap_range"]
     assert [row["near_to_m"] for row in ranges] == [0.0, 0.75]
     assert run_command([*command, "--range", "--offsets", "0,1"]) == 2
@@ -385,7 +420,7 @@ def test_a_log_is_named_by_its_folder_as_a_scene_to_drive_is(tmp_path, monkeypat
     monkeypatch.setattr(
         bench_real,
         "load_scenario",
-        lambda name: loaded.append(name) or SimpleNamespace(scene_id="s", model=None),
+        lambda name, overrides: loaded.append(name) or SimpleNamespace(scene_id="s", model=None),
     )
     (tmp_path / "log").mkdir()
     (tmp_path / "street").mkdir()
