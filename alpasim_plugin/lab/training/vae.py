@@ -17,10 +17,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.block_fixers.clips import GROUP
 from alpasim_plugin.block_fixers.codec_weights import LatentStats
 from alpasim_plugin.block_fixers.tiny_vae import TinyVAE
 from alpasim_plugin.block_fixers.tiny_vae_nets import LATENT
 from alpasim_plugin.core.devices import require_device, upload
+from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.core.types import U8
 from alpasim_plugin.fixers.bundle import parts_of
@@ -61,6 +63,23 @@ class VaeRecipe:
     edge_weight: float = 0.3
     auxiliary_weight: float = 0.3
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.size.frames % GROUP != 1:
+            raise InputError(
+                f"clips of {self.size.frames} frames: the autoencoder takes 1 + {GROUP} k frames",
+                f"Train on {whole_groups(self.size.frames)} frames.",
+            )
+
+
+def whole_groups(frames: int) -> int:
+    """Return the largest number 1 + 4k of frames up to this one.
+
+    Example:
+        >>> [whole_groups(frames) for frames in (1, 4, 5, 60)]
+        [1, 1, 5, 57]
+    """
+    return 1 + (frames - 1) // GROUP * GROUP
 
 
 @dataclass(frozen=True)
@@ -193,7 +212,7 @@ def train_vae(
     trainer = Trainer(vae, out, Schedule(steps), task.batch, task.loss, task.facts)
     trainer.run(report)
     vae.cpu().load_state_dict(trainer.averaged())
-    clips = [to_tensor(s.clip.rgb_gt[:MEASURED_FRAMES])[None] for s in sequences]
+    clips = [measured_clip(sequence) for sequence in sequences]
     mean, std = measure_stats(vae, clips)
     vae.stats = LatentStats(
         (mean * vae.stats.std + vae.stats.mean).tolist(),
@@ -203,6 +222,14 @@ def train_vae(
     path = out / VAE_FILE
     vae.save(path, {"made_by": "simrun train fixer", "steps": str(steps), "seed": str(seed)})
     return path
+
+
+def measured_clip(sequence: PairSequence) -> Tensor:
+    """Return the clean frames ``(1, 3, T, H, W)`` of a sequence that its latents' statistics are
+    measured on.
+    """
+    frames = sequence.clip.rgb_gt[:MEASURED_FRAMES]
+    return to_tensor(frames[: whole_groups(len(frames))])[None]
 
 
 def reconstruction_loss(made: Tensor, wanted: Tensor, edge_weight: float) -> Tensor:

@@ -13,7 +13,12 @@ from alpasim_plugin.block_fixers.tiny_vae_nets import TinySizes
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.lab.training.clips import CropSize, draw_pair_clip, draw_video_clip
 from alpasim_plugin.lab.training.trainer import Schedule, Trainer
-from alpasim_plugin.lab.training.vae import VaeRecipe, VaeTask, channel_amplitudes
+from alpasim_plugin.lab.training.vae import (
+    VaeRecipe,
+    VaeTask,
+    channel_amplitudes,
+    measured_clip,
+)
 from tests.lab.training.pair_files import make
 
 SIZE = CropSize(5, 16, 32)
@@ -39,6 +44,18 @@ def test_clip_larger_than_the_frames_is_refused(tmp_path):
         draw_pair_clip([make(tmp_path)], CropSize(5, 64, 64), 0, 0)
     with pytest.raises(InputError):
         draw_video_clip([np.zeros((4, 32, 48, 3), dtype=np.uint8)], SIZE, 0, 0)
+
+
+def test_clips_that_are_no_whole_groups_are_refused_before_a_training():
+    with pytest.raises(InputError, match="1 \\+ 4 k frames"):
+        VaeRecipe(size=CropSize(8, 16, 32))
+
+
+@pytest.mark.parametrize("frames", [12, 13])
+def test_statistics_are_measured_on_whole_groups_of_frames(tmp_path, frames):
+    clip = measured_clip(make(tmp_path, frames=frames))
+    assert clip.shape[2] == {12: 9, 13: 13}[frames]
+    assert TinyVAE.random().encode(clip).shape[2] == 1 + (clip.shape[2] - 1) // 4
 
 
 def test_a_few_updates_lower_the_loss_of_every_kind(tmp_path):
