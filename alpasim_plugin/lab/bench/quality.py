@@ -48,7 +48,7 @@ from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 7  # of what a row holds and how it is measured; part of its key
+VERSION = 8  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip
@@ -237,6 +237,7 @@ class Work:
         weights: Folder of the metrics' weights.
         out: Folder of rows and images.
         pictured: Whether some frames are kept for a sheet.
+        truth_rows: Folder of the rows of the truth; None: that of the others.
     """
 
     folder: Path
@@ -249,10 +250,13 @@ class Work:
     weights: Path | None
     out: Path
     pictured: bool
+    truth_rows: Path | None = None
 
     @property
     def row_file(self) -> Path:
         """Where the row is kept."""
+        if self.truth_rows is not None and self.variant.label == TRUTH:
+            return self.truth_rows / f"{self.folder.name}.json"
         return self.out / "clips" / self.variant.label / f"{self.folder.name}.json"
 
     def picture_file(self, frame: int) -> Path:

@@ -23,10 +23,17 @@ from alpasim_plugin.lab.paper.experiment import (
     PAGE_FILE,
     Experiment,
     experiment,
-    keep_weights,
+    require_kept_trainings,
     write_results,
 )
-from alpasim_plugin.lab.paper.stages import Placed, State, run_stages
+from alpasim_plugin.lab.paper.stages import (
+    Placed,
+    State,
+    is_kept,
+    keep_stage,
+    restore,
+    run_stages,
+)
 from alpasim_plugin.lab.video_metrics.image_distance import FOLDER_VARIABLE, weights_folder
 
 EPILOG = """
@@ -34,9 +41,9 @@ Examples:
 
 - `simrun bench paper --config small --out runs/paper --dry-run`
 
-- `simrun bench paper --config small --out runs/paper --jobs 2 --keep-weights weights`
+- `simrun bench paper --config small --out runs/paper --keep configs/paper/weights`: in pieces, also on several machines
 
-- `simrun bench paper --config small --out runs/again --weights weights`: the same numbers without training
+- `simrun bench paper --config small --out runs/again --weights configs/paper/weights`: the same numbers without training
 """
 LOCK_FILE = ".lock"
 
@@ -55,16 +62,17 @@ MetricWeights = Annotated[
         "--metric-weights", help=f"Folder of the metrics' weights; also {FOLDER_VARIABLE}."
     ),
 ]
-KeepWeights = Annotated[
+Keep = Annotated[
     Path | None,
     typer.Option(
-        "--keep-weights", help="Copy the trained systems into this folder, SYSTEM.safetensors each."
+        "--keep",
+        help="Folder of complete stages: those of equal key are taken from it, new ones copied into it.",
     ),
 ]
 Weights = Annotated[
     Path | None,
     typer.Option(
-        "--weights", help="Folder of --keep-weights: train nothing, measure and drive these."
+        "--weights", help="Folder of --keep: train nothing, measure and drive its systems."
     ),
 ]
 Jobs = Annotated[
@@ -77,8 +85,8 @@ def paper(
     config: Config,
     out: Out,
     dry_run: DryRun = False,
+    keep: Keep = None,
     weights: Weights = None,
-    keep: KeepWeights = None,
     metric_weights: MetricWeights = None,
     device: Device = "cpu",
     threads: Threads = 1,
@@ -90,16 +98,19 @@ def paper(
     the tables beside the printed ones, with a verdict on each claim.
 
     Writes OUT/paper.json, OUT/paper.md and OUT/figures. Each step is a command of its own below
-    OUT/stages; what is complete is reused, and an interrupted step goes on.
+    OUT/stages; what is complete is reused, and an interrupted step goes on. The tables are written
+    after every step that measures, from what there is.
     """
     del debug
     read, document, _ = load_config(config)
     if weights is not None and keep is not None:
-        raise InputError("--weights and --keep-weights: nothing is trained", "Give one of them.")
+        raise InputError(
+            "--weights and --keep: the one measures again what the other takes", "Give one of them."
+        )
     networks = weights_of(read, document, metric_weights)
-    ready = experiment(read, document, out, networks, Effort(device, threads, jobs), weights)
+    ready = experiment(read, document, out, networks, Effort(device, threads, jobs))
     if not as_json:
-        say(*plan_lines(ready))
+        say(*plan_lines(ready, weights or keep))
     if dry_run:
         if as_json:
             say_document(ready.plan())
@@ -111,15 +122,25 @@ def paper(
         text = f"stage {item.stage.name} ({item.key}): {words}"
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
+    def finished(item: Placed) -> None:
+        if keep is not None:
+            keep_stage(item, keep)
+        if item.stage.is_measurement:
+            write_results(ready)
+
     with one_writer(out / LOCK_FILE, str(out)):
+        if weights is not None:
+            require_kept_trainings(ready, weights)
+        if keep is not None:
+            for item in ready.stages:
+                restore(item, keep)
+                keep_stage(item, keep)
         try:
-            run_stages(ready.stages, execute, report)
+            run_stages(ready.stages, execute, report, finished)
         except Stopped as stop:
             stop.kept = f"complete stages are kept in {out}; the same command continues"
             raise
         record = write_results(ready)
-        if keep is not None:
-            keep_weights(ready, keep)
     if as_json:
         say_document(record)
     else:
@@ -159,12 +180,19 @@ def execute(words: Sequence[str]) -> None:
                 ) from leaving
 
 
-def plan_lines(ready: Experiment) -> list[str]:
-    """Return the plan in words: stages, then claims that are tested, then those left out."""
+def plan_lines(ready: Experiment, kept: Path | None = None) -> list[str]:
+    """Return the plan in words: stages, then claims that are tested, then those left out.
+
+    Args:
+        ready: The experiment.
+        kept: Folder of kept stages, which are marked.
+    """
     lines = [f"stages of {ready.out}"]
     for item in ready.stages:
         stage = item.stage
-        lines.append(f"  {item.state:5} {stage.name:28} {item.key}  {stage.budget}")
+        is_there = item.state != "done" and kept is not None and is_kept(item, kept)
+        state = "kept" if is_there else item.state
+        lines.append(f"  {state:5} {stage.name:28} {item.key}  {stage.budget}")
     tested = [claim for claim in ready.expectations if not claim.left_out]
     lines.append(f"claims that are tested: {len(tested)} of {len(ready.expectations)}")
     for expectation in tested:

@@ -78,6 +78,13 @@ Weights = Annotated[
 Pictures = Annotated[
     int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
 ]
+TruthRows = Annotated[
+    Path | None,
+    typer.Option(
+        "--truth-rows",
+        help="Folder of what the clean frames measure, which several commands share; by default in --out.",
+    ),
+]
 Device = Annotated[Literal["cpu", "cuda"], typer.Option("--device", help="Where fixers compute.")]
 Jobs = Annotated[
     int,
@@ -105,6 +112,7 @@ def quality(
     overrides: Overrides = None,
     weights: Weights = None,
     pictures: Pictures = 4,
+    truth_rows: TruthRows = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
     device: Device = "cpu",
     jobs: Jobs = 1,
@@ -137,6 +145,7 @@ def quality(
             weights_folder(weights),
             out,
             sequence.name in pictured_names,
+            truth_rows,
         )
         for sequence in sequences
         for variant in (*variants, Variant(TRUTH))

@@ -30,6 +30,7 @@ from evaluators.statistics.intervals import median_interval
 from evaluators.statistics.verdicts import ALPHA, POWER, holm, sign_test
 
 FILE = HERE / "claims.yaml"
+TIME = "ms_per_frame"
 Verdict = Literal["holds", "does not hold", "undecided"]
 
 
@@ -161,6 +162,13 @@ class Design:
     scenes: int
     drive_rows: frozenset[str]
     drive_scenes: int
+    times_scenes: int = 0  # 0: times are not measured
+
+    def scenes_of(self, claim: Claim, metric: str) -> int:
+        """Return on how many scenes a metric of a claim is compared."""
+        if metric == TIME:
+            return self.times_scenes
+        return self.drive_scenes if claim.drive else self.scenes
 
 
 def expected(
@@ -192,7 +200,9 @@ def expected(
         if spread is None:
             return Expected(claim, None, f"the pilot says no spread of {metric}")
         power_of = mean_test_power if claim.drive else sign_test_power
-        scenes = design.drive_scenes if claim.drive else design.scenes
+        scenes = design.scenes_of(claim, metric)
+        if scenes == 0:
+            return Expected(claim, None, "times are not measured")
         margin = claims().margins[metric]
         powers.append(power_of(spread, margin, scenes, len(claim.comparisons)))
     power = min(powers)
@@ -350,7 +360,7 @@ def clip_test(
         bounds,
         sign_test(up, down),
         (up > down) - (up < down),
-        scenes_for_sign_test(up, down, count),
+        scenes_for_sign_test(up, down, len(gains) - up - down, count),
     )
 
 
@@ -380,15 +390,17 @@ def drive_test(drive: ClosedLoop, row: str, other: str, metric: str) -> Tested:
     )
 
 
-def scenes_for_sign_test(up: int, down: int, tests: int) -> int | None:
+def scenes_for_sign_test(up: int, down: int, ties: int, tests: int) -> int | None:
     """Return the number of scenes at which the sign test at Holm's first level for ``tests`` tests
-    shows a difference with probability `POWER` (normal approximation), if scenes go up as often as
-    these did; None where as many go down.
+    shows a difference with probability `POWER` (normal approximation), if scenes go up, go down and
+    tie as often as these did; None where as many go down. The test leaves ties out.
 
     Example:
-        >>> scenes_for_sign_test(up=20, down=10, tests=1)
+        >>> scenes_for_sign_test(up=20, down=10, ties=0, tests=1)
         69
-        >>> scenes_for_sign_test(up=5, down=0, tests=1)  # all to one side: 2 / 2^6 < 5 %
+        >>> scenes_for_sign_test(up=20, down=10, ties=30, tests=1)
+        138
+        >>> scenes_for_sign_test(up=5, down=0, ties=0, tests=1)  # all to one side: 2 / 2^6 < 5 %
         6
     """
     if up == down:
@@ -397,4 +409,5 @@ def scenes_for_sign_test(up: int, down: int, tests: int) -> int | None:
     critical, wanted = scipy.special.ndtri([1.0 - ALPHA / (2.0 * tests), POWER])
     half = critical * 0.5 + wanted * math.sqrt(share * (1.0 - share))
     fewest = math.ceil(math.log2(2.0 * tests / ALPHA))
-    return max(math.ceil((half / (share - 0.5)) ** 2), fewest)
+    untied = max(math.ceil((half / (share - 0.5)) ** 2), fewest)
+    return math.ceil(untied * (up + down + ties) / (up + down))

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
-from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.parts import resolve
-from alpasim_plugin.core.parts.source import package_digest
 from alpasim_plugin.lab.bench.quality import VERSION, metric_digests
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig, SceneSet, system_of
+from alpasim_plugin.lab.paper.records import QUALITY_FILE, SUMMARY_FILE
 from alpasim_plugin.lab.paper.stages import Stage
 from alpasim_plugin.lab.training.recipes.ablation import BASE, BASE_BI
 from alpasim_plugin.lab.training.recipes.recipe import INIT, INIT_BI, Recipe
 from alpasim_plugin.lab.training.recipes.registry import recipe_of
+from alpasim_plugin.lab.training.vae import VAE_FILE
 
 BUNDLE = "fixer.safetensors"
+CARD = "fixer.card.json"
 PAIRS_TRAIN = "pairs-train"
 PAIRS_TEST = "pairs-test"
 AUTOENCODER = "autoencoder"
 DRIVE = "drive"
+TIMES = "times"
+TRUTH_ROWS = "truth-rows"  # folder of the experiment: rows of the clean frames, measured once
 RUN = "run"  # the run folder in the stage's
 
 # Recipe -> its stages whose weights other recipes train anyway: stage -> recipe and folder.
@@ -40,10 +41,10 @@ SHARED: Mapping[str, Mapping[str, tuple[str, str]]] = {
 
 @dataclass(frozen=True)
 class Effort:
-    """How the commands are run; the results do not depend on it.
+    """How the commands are run; beside the device, results do not depend on it.
 
     Attributes:
-        device: Where networks compute.
+        device: Where networks compute. A training may go on on another; a measurement may not.
         threads: Torch threads of a training.
         jobs: Processes of everything else.
     """
@@ -63,83 +64,59 @@ def train_name(system: str) -> str:
     return f"train-{system}"
 
 
-@dataclass(frozen=True)
-class Network:
-    """Where a system's weights come from.
-
-    Attributes:
-        path: The bundle, or a placeholder for the folder of the stage that trains it and its name.
-        reads: That stage; none where the weights are given.
-        digests: SHA-256 of given weights by system.
-    """
-
-    path: str
-    reads: tuple[str, ...] = ()
-    digests: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-
-
-def network_of(system: str, kept: Path | None) -> Network:
-    """Return a system's weights: those of the stage that trains it, or kept ones.
-
-    Args:
-        system: The recipe.
-        kept: Folder of `keep_weights`; None: the system is trained.
-
-    Raises:
-        InputError: The folder does not have them.
-    """
-    if kept is None:
-        name = train_name(system)
-        return Network(f"{{{name}}}/{BUNDLE}", (name,))
-    path = kept / f"{system}.safetensors"
-    if not path.is_file():
-        raise InputError(
-            f"--weights {kept}: no {path.name}",
-            "Name a folder that --keep-weights has filled with the same configuration.",
-        )
-    return Network(str(path), digests={system: file_sha256(path)})
-
-
 def comparison(
-    config: PaperConfig, weights: Path | None, effort: Effort, kept: Path | None = None
+    config: PaperConfig,
+    weights: Path | None,
+    effort: Effort,
+    out: Path,
+    first: Sequence[str] = (),
 ) -> list[Stage]:
-    """Return the stages, each after those that it reads.
+    """Return the stages, each after those that it reads; a row is measured as soon as its system is
+    trained.
 
     Args:
         config: What is compared, at which budget.
         weights: Folder of the metrics' weights.
         effort: How the commands are run.
-        kept: Folder of trained systems, which are then not trained; None: all are.
-
-    Raises:
-        InputError: The folder lacks a system.
+        out: Folder of the experiment.
+        first: Rows that are wanted before the others, in order.
     """
-    stages = [] if kept is not None else _trainings(config, effort)
-    stages += _pairs(PAIRS_TEST, config.test, effort)
-    for label in config.labels:
-        network = Network("") if label == RAW else network_of(system_of(label), kept)
-        stages.append(_quality(label, config, network, weights, effort))
+    rows = list(dict.fromkeys((*first, *config.labels)))
+    measured = [row for row in rows if row in config.labels and row != RAW]
+    stages = _pairs(PAIRS_TEST, config.test, effort)
+    stages.append(_quality(RAW, config, weights, effort, out))
+    stages += [*_pairs(PAIRS_TRAIN, config.train, effort), _autoencoder(config, effort)]
+    for row in measured:
+        stages += _not_yet(stages, _trainings(config, [row], effort))
+        stages.append(_quality(row, config, weights, effort, out))
     if config.drive is not None:
-        stages += _drives(config, effort, kept)
+        driven = [row for row in config.drive.renderers if row != RAW]
+        stages += _not_yet(stages, _trainings(config, driven, effort))
+        stages += _drives(config, effort)
+    if config.times is not None:
+        stages.append(_times(config, effort))
     return stages
 
 
-def _trainings(config: PaperConfig, effort: Effort) -> list[Stage]:
-    """Return the stages that end with the weights of all systems."""
-    stages = [*_pairs(PAIRS_TRAIN, config.train, effort), _autoencoder(config, effort)]
-    systems = systems_of(config)
+def _not_yet(stages: Sequence[Stage], more: Sequence[Stage]) -> list[Stage]:
+    names = {stage.name for stage in stages}
+    return [stage for stage in more if stage.name not in names]
+
+
+def _trainings(config: PaperConfig, rows: Sequence[str], effort: Effort) -> list[Stage]:
+    """Return the stages that train the systems of rows, after pairs and autoencoder."""
+    systems = systems_of(rows)
     needed = {source for system in systems for source in _inits(recipe_of(system))}
-    for base, source in ((BASE, INIT), (BASE_BI, INIT_BI)):
-        if source in needed:
-            stages.append(_base(base, config, effort))
-    return stages + [_system(system, config, effort) for system in systems]
+    bases = [
+        _base(base, config, effort)
+        for base, source in ((BASE, INIT), (BASE_BI, INIT_BI))
+        if source in needed
+    ]
+    return bases + [_system(system, config, effort) for system in systems]
 
 
-def systems_of(config: PaperConfig) -> list[str]:
-    """Return the recipes to train, each after those whose weights it shares."""
-    rows = [*config.systems, *config.ablation]
-    if config.drive is not None:
-        rows += [row for row in config.drive.renderers if row != RAW]
+def systems_of(rows: Sequence[str]) -> list[str]:
+    """Return the recipes of rows, each after those whose weights it shares."""
     systems: dict[str, None] = {}
 
     def add(system: str) -> None:
@@ -187,6 +164,7 @@ def _autoencoder(config: PaperConfig, effort: Effort) -> Stage:
         (PAIRS_TRAIN,),
         effort=_computed(effort),
         budget=_updates(updates),
+        products=(VAE_FILE,),
     )
 
 
@@ -219,6 +197,7 @@ def _base(name: str, config: PaperConfig, effort: Effort) -> Stage:
         (PAIRS_TRAIN, AUTOENCODER),
         effort=_computed(effort),
         budget=_updates(updates),
+        products=(BUNDLE, CARD),
     )
 
 
@@ -252,43 +231,84 @@ def _system(system: str, config: PaperConfig, effort: Effort) -> Stage:
         tuple(dict.fromkeys(reads)),
         effort=_computed(effort),
         budget=_updates(updates),
+        products=(BUNDLE, CARD, *_shared_bundles(system)),
     )
+
+
+def _shared_bundles(system: str) -> list[str]:
+    """Return the bundles of a system's earlier stages that other systems go on from."""
+    folders = {
+        folder
+        for shared in SHARED.values()
+        for other, folder in shared.values()
+        if other == system and folder
+    }
+    return [f"{folder}{BUNDLE}" for folder in sorted(folders)]
+
+
+def _bundle(row: str) -> str:
+    """Return the placeholder of the weights of a row's system."""
+    return f"{{{train_name(system_of(row))}}}/{BUNDLE}"
+
+
+def _variants(rows: Sequence[str]) -> list[str]:
+    """Return the options of ``bench quality`` that name rows and their steps."""
+    fixers = [row if row == RAW else f"{row}={_bundle(row)}" for row in rows]
+    words = ["--fixer", ",".join(fixers), "--baseline", rows[0]]
+    for row in rows:
+        if steps := row.partition("@")[2]:
+            words += ["--set", f"{row}:fixer.steps={steps}"]
+    return words
 
 
 def _quality(
-    label: str, config: PaperConfig, network: Network, weights: Path | None, effort: Effort
+    row: str, config: PaperConfig, weights: Path | None, effort: Effort, out: Path
 ) -> Stage:
-    fixer = label if label == RAW else f"{label}={network.path}"
     words = ["bench", "quality", f"{{{PAIRS_TEST}}}", "--split", config.test.split]
-    words += ["--fixer", fixer, "--baseline", label, "--frames", str(config.frames)]
-    words += ["--pictures", "0", "--out", "{out}"]
-    if steps := label.partition("@")[2]:
-        words += ["--set", f"{label}:fixer.steps={steps}"]
+    words += [*_variants([row]), "--frames", str(config.frames), "--pictures", "0"]
     extra = ["--jobs", str(effort.jobs), "--device", effort.device]
+    extra += ["--truth-rows", str(out / TRUTH_ROWS)]
     if weights is not None:
         extra += ["--metric-weights", str(weights)]
     return Stage(
-        quality_name(label),
-        tuple(words),
-        (PAIRS_TEST, *network.reads),
-        {
-            "version": VERSION,
-            "networks": metric_digests(weights),
-            "weights": dict(network.digests),
-        },
+        quality_name(row),
+        (*words, "--out", "{out}"),
+        (PAIRS_TEST, *_trained([row])),
+        {"version": VERSION, "networks": metric_digests(weights), "device": effort.device},
         tuple(extra),
         f"{config.test.scenes} clips of up to {config.frames} frames",
+        (QUALITY_FILE,),
     )
 
 
-def _drives(config: PaperConfig, effort: Effort, kept: Path | None) -> list[Stage]:
+def _trained(rows: Sequence[str]) -> list[str]:
+    return list(dict.fromkeys(train_name(system_of(row)) for row in rows if row != RAW))
+
+
+def _times(config: PaperConfig, effort: Effort) -> Stage:
+    """Return the stage that measures the times of all rows side by side, one process at a time."""
+    assert config.times is not None
+    rows = [row for row in config.labels if row != RAW]
+    words = ["bench", "quality", f"{{{PAIRS_TEST}}}", "--split", config.test.split]
+    words += [*_variants(rows), "--frames", str(config.times.frames), "--pictures", "0"]
+    words += ["--clips", str(config.times.scenes), "--jobs", "1", "--threads", "1"]
+    return Stage(
+        TIMES,
+        (*words, "--out", "{out}"),
+        (PAIRS_TEST, *_trained(rows)),
+        {"version": VERSION, "device": effort.device},
+        ("--device", effort.device),
+        f"{len(rows)} rows, {config.times.scenes} clips of {config.times.frames} frames",
+        (QUALITY_FILE,),
+    )
+
+
+def _drives(config: PaperConfig, effort: Effort) -> list[Stage]:
     drive = config.drive
     assert drive is not None
     sets = {f"scenes-{DRIVE}-{i}": scenes for i, scenes in enumerate(drive.scenes)}
     rows = [row for row in drive.renderers if row != RAW]
-    networks = {row: network_of(system_of(row), kept) for row in rows}
-    renderers = [_renderer(row, networks[row]) for row in rows]
-    words = ["run", "--renderer", ",".join([RAW, *renderers])]
+    words = ["run", "--renderer", ",".join([RAW, *(_renderer(row) for row in rows)])]
     words += ["--baseline", RAW, "--policy", drive.policy, "--seeds", str(drive.seeds)]
     words += ["--preset", drive.preset, "--images", "none", "--out", f"{{out}}/{RUN}"]
     words += [f"{{{name}}}/{scenes.split}" for name, scenes in sets.items()]
@@ -296,14 +316,14 @@ def _drives(config: PaperConfig, effort: Effort, kept: Path | None) -> list[Stag
     run = Stage(
         DRIVE,
         tuple(words),
-        (*sets, *dict.fromkeys(name for network in networks.values() for name in network.reads)),
+        (*sets, *_trained(rows)),
         {
-            "program": package_digest(),  # a run reuses no rollout of another program either
             "policy": resolve("policy", drive.policy).digest,
-            "weights": {row: dict(network.digests) for row, network in networks.items()},
+            "device": effort.device,
         },
         ("--workers", str(effort.jobs), "--device", effort.device),
         f"{len(rows) + 1} renderers, {count} scenes, {drive.seeds} seeds",
+        (f"{RUN}/{SUMMARY_FILE}",),
     )
     return [*(_scenes(name, scenes) for name, scenes in sets.items()), run]
 
@@ -314,10 +334,10 @@ def drive_rows(config: PaperConfig) -> list[str]:
     return [RAW, *(row for row in rows if row != RAW)]
 
 
-def _renderer(row: str, network: Network) -> str:
+def _renderer(row: str) -> str:
     steps = row.partition("@")[2]
     name = recipe_of(system_of(row)).fixer + (f"@{steps}" if steps else "")
-    return f"{name}[weights.bundle={network.path}]+{RAW}"
+    return f"{name}[weights.bundle={_bundle(row)}]+{RAW}"
 
 
 def _updates(count: int) -> str:

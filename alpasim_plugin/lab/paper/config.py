@@ -68,6 +68,13 @@ class Drive(_Strict):
     preset: str = Field(default="paper", description="Preset of the evaluators.")
 
 
+class Times(_Strict):
+    """The times of all rows, measured side by side on one machine, one process at a time."""
+
+    scenes: int = Field(ge=2, description="How many of the test scenes, evenly chosen.")
+    frames: int = Field(default=41, ge=2, description="First frames of a clip.")
+
+
 class Pilot(_Strict):
     """Records of a small measurement whose spread gives the power of the claims."""
 
@@ -89,6 +96,7 @@ class PaperConfig(_Strict):
     systems: tuple[str, ...] = Field(min_length=1, description="Rows of Table 1, NAME[@STEPS].")
     ablation: tuple[str, ...] = Field(default=(), description="Rows of the ablation.")
     drive: Drive | None = Field(default=None, description="The closed loop; none: not driven.")
+    times: Times | None = Field(default=None, description="Times of a frame; none: not measured.")
     pilot: Pilot = Field(description="What the power is computed from.")
     least_power: float = Field(
         default=0.5, ge=0.0, le=1.0, description="Claims of less power are left out."

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from alpasim_plugin.core.files import read_bytes
-from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
+from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.files.atomic import write_json, write_text
 from alpasim_plugin.core.files.config import Document
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.lab.paper import tables
 from alpasim_plugin.lab.paper.claims import Decided, Design, Expected, claims, decide, expected
 from alpasim_plugin.lab.paper.comparison import (
-    BUNDLE,
     DRIVE,
     RUN,
+    TIMES,
     Effort,
     comparison,
     drive_rows,
     quality_name,
-    systems_of,
-    train_name,
 )
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig
 from alpasim_plugin.lab.paper.figures import write_figures
@@ -35,7 +33,7 @@ from alpasim_plugin.lab.paper.records import (
     read_drive_spreads,
     read_quality,
 )
-from alpasim_plugin.lab.paper.stages import Placed, place
+from alpasim_plugin.lab.paper.stages import Placed, needed, place, restore, why_not_restored
 
 RECORD_FILE = "paper.json"
 PAGE_FILE = "paper.md"
@@ -68,6 +66,7 @@ class Experiment:
                     "state": item.state,
                     "budget": item.stage.budget,
                     "command": ["simrun", *item.words],
+                    "program": item.record["program"] if item.state == "done" else None,
                 }
                 for item in self.stages
             ],
@@ -76,12 +75,7 @@ class Experiment:
 
 
 def experiment(
-    config: PaperConfig,
-    document: Document,
-    out: Path,
-    weights: Path | None,
-    effort: Effort,
-    kept: Path | None = None,
+    config: PaperConfig, document: Document, out: Path, weights: Path | None, effort: Effort
 ) -> Experiment:
     """Return the experiment that a configuration describes; nothing is run.
 
@@ -91,50 +85,72 @@ def experiment(
         out: Folder of everything that is written.
         weights: Folder of the metrics' weights.
         effort: How the commands are run.
-        kept: Folder of trained systems, which are then not trained.
 
     Raises:
-        InputError: The pilot is not there, or of another program; or a kept system is missing.
+        InputError: The pilot is not there, or of another program.
     """
-    stages = place(comparison(config, weights, effort, kept), out)
     folder = document.folder_of(("pilot",))
     pilot = read_quality([folder / config.pilot.quality])
     drive_spreads: dict[str, float] = {}
     if config.pilot.drive is not None:
         drive_spreads = read_drive_spreads(folder / config.pilot.drive)
-    scenes = sum(item.scenes for item in config.drive.scenes) if config.drive else 0
-    rows = frozenset(drive_rows(config)) if config.drive else frozenset()
-    design = Design(frozenset(config.labels), config.test.scenes, rows, scenes)
+    design = design_of(config)
     expectations = tuple(
         expected(claim, design, pilot, drive_spreads, config.least_power)
         for claim in claims().claims
     )
-    return Experiment(config, out, tuple(stages), expectations)
+    stages = comparison(config, weights, effort, out, rows_by_claims(expectations))
+    return Experiment(config, out, tuple(place(stages, out)), expectations)
+
+
+def design_of(config: PaperConfig) -> Design:
+    """Return what a configuration measures."""
+    return Design(
+        frozenset(config.labels),
+        config.test.scenes,
+        frozenset(drive_rows(config)) if config.drive else frozenset(),
+        sum(item.scenes for item in config.drive.scenes) if config.drive else 0,
+        min(config.times.scenes, config.test.scenes) if config.times else 0,
+    )
+
+
+def rows_by_claims(expectations: Sequence[Expected]) -> list[str]:
+    """Return the rows of the claims that are tested, those of claims about few rows first: what is
+    decided early needs few trainings.
+    """
+    tested = [item.claim for item in expectations if not item.left_out and not item.claim.drive]
+    by_size = sorted(tested, key=lambda claim: len(claim.rows))
+    return list(dict.fromkeys(row for claim in by_size for row in claim.rows))
 
 
 def write_results(ready: Experiment) -> JsonObject:
     """Write tables and verdicts from the records of complete stages, and return them.
 
-    Writes ``paper.json``, ``paper.md`` and the figures.
+    Writes ``paper.json``, ``paper.md`` and the figures. Rows without a record are left out of the
+    tables, and claims about them have no verdict yet.
 
     Raises:
-        InputError: A record is missing or of another program.
+        InputError: A record is of another program.
     """
     config = ready.config
-    folders = {item.stage.name: item.folder for item in ready.stages}
-    quality = read_quality([folders[quality_name(label)] / QUALITY_FILE for label in config.labels])
+    done = {item.stage.name: item.folder for item in ready.stages if item.state == "done"}
+    rows = [row for row in config.labels if quality_name(row) in done]
+    quality = read_quality([done[quality_name(row)] / QUALITY_FILE for row in rows])
+    times = read_quality([done[TIMES] / QUALITY_FILE]) if TIMES in done else None
+    quality = quality.with_times_of(times)
     drive = ClosedLoop()
-    if config.drive is not None:
-        rows = drive_rows(config)
-        drive = read_closed_loop(folders[DRIVE] / RUN / SUMMARY_FILE, rows)
-    decided = [decide(item, quality, drive) for item in ready.expectations]
+    if DRIVE in done:
+        drive = read_closed_loop(done[DRIVE] / RUN / SUMMARY_FILE, drive_rows(config))
+    decided = [
+        decide(_measured(item, quality, drive), quality, drive) for item in ready.expectations
+    ]
     cells = _cells(config, quality, drive)
     record = {
         **ready.plan(),
         "config": config.model_dump(),
         "source": printed().source,
         "tables": cells,
-        "figures": write_figures(config.labels, quality, ready.out),
+        "figures": write_figures(rows, quality, ready.out),
         "claims": [item.as_dict() for item in decided],
     }
     write_json(ready.out / RECORD_FILE, record)
@@ -142,34 +158,44 @@ def write_results(ready: Experiment) -> JsonObject:
     return record
 
 
-def keep_weights(ready: Experiment, folder: Path) -> list[Path]:
-    """Copy the bundle and the card of every trained system into a folder, and return the bundles.
+def _measured(expectation: Expected, quality: Quality, drive: ClosedLoop) -> Expected:
+    """Return what is expected of a claim, left out where a row is not measured yet."""
+    measured = drive.means if expectation.claim.drive else quality.by_scene
+    absent = [row for row in expectation.claim.rows if row not in measured]
+    if expectation.left_out or not absent:
+        return expectation
+    return replace(expectation, left_out=f"not measured yet: {', '.join(absent)}")
+
+
+def require_kept_trainings(ready: Experiment, kept: Path) -> None:
+    """Take the trained systems of a kept folder in place of training them.
 
     Raises:
-        InputError: A system is not trained.
+        InputError: It lacks a system, or has one of another budget.
     """
-    folders = {item.stage.name: item.folder for item in ready.stages}
-    copies = []
-    for system in systems_of(ready.config):
-        trained = folders[train_name(system)] / BUNDLE
-        copies.append(folder / f"{system}.safetensors")
-        for source, target in (
-            (trained, copies[-1]),
-            (trained.with_suffix(".card.json"), folder / f"{system}.card.json"),
-        ):
-            write_bytes(target, read_bytes(source))
-    return copies
+    for item in ready.stages:
+        if item.stage.is_training:
+            restore(item, kept)
+    open_trainings = [
+        item for item in needed(ready.stages) if item.stage.is_training and item.state != "done"
+    ]
+    if open_trainings:
+        # The last one: those before it may be needed only to train it
+        raise InputError(
+            f"--weights {kept}: {why_not_restored(open_trainings[-1], kept)}",
+            "Name a folder that --keep has filled with the same configuration.",
+        )
 
 
 def _cells(config: PaperConfig, quality: Quality, drive: ClosedLoop) -> JsonObject:
     printed_tables = printed().tables
     rows = [RAW, *config.systems]
-    cells = {"cycle": tables.quality_table(printed_tables["cycle"], rows, quality)}
-    if config.ablation:
-        cells["ablation"] = tables.quality_table(
-            printed_tables["ablation"], config.ablation, quality
-        )
-    if config.drive is not None:
+    measured = [row for row in rows if row in quality.by_scene]
+    cells = {"cycle": tables.quality_table(printed_tables["cycle"], measured, quality)}
+    ablation = [row for row in config.ablation if row in quality.by_scene]
+    if ablation:
+        cells["ablation"] = tables.quality_table(printed_tables["ablation"], ablation, quality)
+    if drive.means:
         cells["closed-loop"] = tables.drive_table(
             printed_tables["closed-loop"], drive_rows(config), drive
         )

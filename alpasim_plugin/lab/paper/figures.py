@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from alpasim_plugin.core.files.atomic import write_bytes
-from alpasim_plugin.lab.paper.claims import measured_as
+from alpasim_plugin.lab.paper.claims import TIME, measured_as
 from alpasim_plugin.lab.paper.config import RAW
 from alpasim_plugin.lab.paper.printed import printed
 from alpasim_plugin.lab.paper.records import Quality
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 ONEFIXER = "V9"
 STEADINESS = "warp_l1"
 DISTANCE = "lpips"
-TIME = "ms_per_frame"
 POINTS_A_MS = 4.0  # area of a bubble
 FOLDER = "figures"
 

@@ -15,6 +15,7 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_json_object
 from alpasim_plugin.core.types import F64
 from alpasim_plugin.lab.paper.printed import printed
+from alpasim_plugin.lab.video_metrics.facts import MS
 from evaluators.results import Difference, Mean, read_summary
 
 QUALITY_FILE = "quality.json"
@@ -38,6 +39,18 @@ class Quality:
         ours = self.by_scene[row].get(metric, {})
         theirs = self.by_scene[other].get(metric, {})
         return np.array([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
+
+    def with_times_of(self, times: Quality | None) -> Quality:
+        """Return the record with the times of another, which measured all rows side by side; without
+        times where that is None. Its own are of stages that ran at other hours, on machines that may
+        differ.
+        """
+        by_scene: dict[str, Mapping[str, Mapping[str, float]]] = {}
+        for row, metrics in self.by_scene.items():
+            by_scene[row] = {name: values for name, values in metrics.items() if name != MS}
+            if times is not None and MS in times.by_scene.get(row, {}):
+                by_scene[row] = {**by_scene[row], MS: times.by_scene[row][MS]}
+        return Quality(by_scene, self.sets)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,9 @@
 A stage's key is a digest of what makes its results: the words of its command, what else it states,
 and the keys of the stages that it reads. Its folder is OUT/stages/NAME-KEY, in which `MARKER` is
 written last. So a changed stage and all that read it are made again, and nothing else is.
+
+A stage that names its `products` can be kept: they and the marker lie in KEPT/NAME, and stand for the
+stage wherever its key is the same, on another machine too. What only made them is then not made.
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from alpasim_plugin.core.errors import InfrastructureError, InputError
-from alpasim_plugin.core.files import read_json_object
-from alpasim_plugin.core.files.atomic import write_json
+from alpasim_plugin.core.files import read_bytes, read_json_object
+from alpasim_plugin.core.files.atomic import write_bytes, write_json
 from alpasim_plugin.core.parts.source import package_digest
 
 MARKER = "stage.json"
@@ -44,6 +47,8 @@ class Stage:
         effort: Further words of the command on which the results do not depend, such as the number
             of processes.
         budget: What it costs, in words.
+        products: Files of its folder that are all that other stages and the tables read; none where
+            the stage is made again on every machine.
     """
 
     name: str
@@ -52,6 +57,17 @@ class Stage:
     facts: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     effort: tuple[str, ...] = ()
     budget: str = ""
+    products: tuple[str, ...] = ()
+
+    @property
+    def is_training(self) -> bool:
+        """Whether its products are weights."""
+        return any(name.endswith(".safetensors") for name in self.products)
+
+    @property
+    def is_measurement(self) -> bool:
+        """Whether its products are records for the tables."""
+        return bool(self.products) and not self.is_training
 
 
 @dataclass(frozen=True)
@@ -129,19 +145,41 @@ def place(stages: Sequence[Stage], out: Path) -> list[Placed]:
     return list(placed.values())
 
 
-def run_stages(placed: Sequence[Placed], execute: Execute, report: Report) -> None:
-    """Run the stages that are not complete, in order; a begun one goes on from its checkpoints.
+def needed(placed: Sequence[Placed]) -> list[Placed]:
+    """Return the stages whose results are wanted: those that no other reads, and what a wanted stage
+    reads that is not complete.
+
+    Args:
+        placed: The stages, each after those that it reads.
+    """
+    read_by_any = {name for item in placed for name in item.stage.reads}
+    wanted = {item.stage.name for item in placed} - read_by_any
+    for item in reversed(placed):
+        if item.stage.name in wanted and item.state != "done":
+            wanted.update(item.stage.reads)
+    return [item for item in placed if item.stage.name in wanted]
+
+
+def run_stages(
+    placed: Sequence[Placed],
+    execute: Execute,
+    report: Report,
+    finished: Callable[[Placed], None] = lambda item: None,
+) -> None:
+    """Run the stages that are needed and not complete, in order; a begun one goes on from its
+    checkpoints.
 
     Args:
         placed: The stages.
         execute: Runs the words of a command, and raises where it fails.
         report: Called with every stage and its state before it is run or reused.
+        finished: Called with every stage that was run.
 
     Raises:
         InfrastructureError: A command ended without an error, and without results.
         InputError: A marker is of another stage.
     """
-    for item in placed:
+    for item in needed(placed):
         state = item.state
         report(item, state)
         if state == "done":
@@ -160,7 +198,8 @@ def run_stages(placed: Sequence[Placed], execute: Execute, report: Report) -> No
             {
                 "stage": item.stage.name,
                 "key": item.key,
-                "command": ["simrun", *item.words],
+                "command": ["simrun", *item.stage.command],
+                "effort": list(item.stage.effort),
                 "facts": dict(item.stage.facts),
                 "reads": list(item.stage.reads),
                 "program": package_digest(),
@@ -169,6 +208,59 @@ def run_stages(placed: Sequence[Placed], execute: Execute, report: Report) -> No
                 "was_resumed": state == "begun",
             },
         )
+        finished(item)
+
+
+def keep_stage(item: Placed, kept: Path) -> None:
+    """Copy the products and the marker of a complete stage to KEPT/NAME, unless they are there; nothing
+    of a stage without products.
+    """
+    if item.stage.products and item.state == "done" and not is_kept(item, kept):
+        _copy(item.stage.products, item.folder, kept / item.stage.name)
+
+
+def is_kept(item: Placed, kept: Path) -> bool:
+    """Whether a kept folder has a stage with the same key."""
+    path = kept / item.stage.name / MARKER
+    return (
+        bool(item.stage.products)
+        and path.is_file()
+        and read_json_object(path).get("key") == item.key
+    )
+
+
+def restore(item: Placed, kept: Path) -> None:
+    """Copy the products and the marker of a kept stage with the same key to the stage's folder,
+    unless it is complete.
+
+    Raises:
+        InputError: A product is missing, or the marker cannot be read.
+    """
+    if item.state != "done" and is_kept(item, kept):
+        _copy(item.stage.products, kept / item.stage.name, item.folder)
+
+
+def _copy(products: Sequence[str], source: Path, target: Path) -> None:
+    for name in (*products, MARKER):
+        write_bytes(target / name, read_bytes(source / name))
+
+
+def why_not_restored(item: Placed, kept: Path) -> str:
+    """Return in words why a kept folder does not stand for a stage."""
+    path = kept / item.stage.name / MARKER
+    if not path.is_file():
+        return f"no {path}"
+    marker = read_json_object(path)
+    theirs = list(marker["command"][1:])
+    ours = list(item.stage.command)
+    if theirs == ours:
+        return f"{path} is of the same command, on other weights or data"
+    differing = [
+        f"{' '.join(ours[max(i - 1, 0) : i + 1])}, kept {theirs[i]}"
+        for i in range(min(len(ours), len(theirs)))
+        if ours[i] != theirs[i]
+    ]
+    return f"{path} is of another command: {differing[0] if differing else ' '.join(theirs)}"
 
 
 def core_seconds() -> float:

@@ -1,6 +1,7 @@
 """Claims as comparisons: power before, verdict afterwards, and what the shipped files say."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,7 +66,20 @@ def test_power_of_extreme_cases():
     assert sign_test_power(0.0, 0.1, 6, 1) == 1.0
     assert sign_test_power(0.0, 0.1, 8, 8) == 0.0  # 2 / 2^8 is above 5 % / 8
     assert mean_test_power(0.0, 0.1, 1, 1) == 1.0
-    assert scenes_for_sign_test(3, 3, 1) is None
+    assert scenes_for_sign_test(3, 3, 0, 1) is None
+
+
+def test_scenes_that_tie_are_scenes_too():
+    """With half of the scenes tied, the number that is said shows the difference in four of five."""
+    wanted = scenes_for_sign_test(16, 4, 20, 1)
+    rng = stream("", 2, "tests/ties")
+    signs = rng.choice([1, -1, 0], p=[0.4, 0.1, 0.5], size=(2000, wanted))
+    ups, downs = (signs > 0).sum(axis=1), (signs < 0).sum(axis=1)
+    shown = [
+        stats.binomtest(int(up), int(up + down)).pvalue < 0.05 and up > down
+        for up, down in zip(ups, downs, strict=True)
+    ]
+    assert np.mean(shown) == pytest.approx(0.8, abs=0.08)
 
 
 def claim(**more):
@@ -89,6 +103,30 @@ def test_weak_claims_are_left_out_and_say_their_power():
     unmeasured = expected(claim(metrics=("dists",)), design, pilot, {}, 0.5)
     assert unmeasured.left_out == "the pilot says no spread of dists"
     assert decide(weak, pilot, ClosedLoop()).verdict is None
+
+
+def test_claims_about_times_count_the_scenes_of_the_times():
+    pilot = Quality(
+        {
+            "a": {"ms_per_frame": {"x": 1.0, "y": 2.0, "z": 3.0}},
+            "b": {"ms_per_frame": {"x": 1.0, "y": 2.1, "z": 2.9}},
+        },
+        {},
+    )
+    about_times = claim(metrics=("ms_per_frame",))
+    design = Design(frozenset({"V9", "V1"}), 30, frozenset(), 0)
+    assert expected(about_times, design, pilot, {}, 0.5).left_out == "times are not measured"
+    timed = replace(design, times_scenes=12)
+    got = expected(about_times, timed, pilot, {}, 0.5)
+    assert got.power == pytest.approx(sign_test_power(0.1, 1.0, 12, 1))
+
+
+def test_times_come_from_where_all_rows_were_measured_side_by_side():
+    hurried = Quality({"V9": {"ms_per_frame": {"x": 1.0}, "psnr_db": {"x": 20.0}}}, {})
+    assert hurried.with_times_of(None).by_scene == {"V9": {"psnr_db": {"x": 20.0}}}
+    side_by_side = Quality({"V9": {"ms_per_frame": {"x": 9.0}, "psnr_db": {"x": 1.0}}}, {})
+    merged = hurried.with_times_of(side_by_side).by_scene["V9"]
+    assert merged == {"psnr_db": {"x": 20.0}, "ms_per_frame": {"x": 9.0}}
 
 
 def test_a_claim_about_drives_needs_a_spread_of_drives(tmp_path):

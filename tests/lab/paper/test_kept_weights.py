@@ -33,8 +33,9 @@ def test_the_wheel_leaves_the_weights_of_the_papers_systems_out(repo, tmp_path):
     (tmp_path / "alpasim_plugin").mkdir()
     shutil.copy(repo / "alpasim_plugin" / "__init__.py", tmp_path / "alpasim_plugin")
     weights = tmp_path / "configs" / "paper" / "weights"
-    for name in ("V9.safetensors", "V9.card.json"):
-        (weights / name).write_bytes(b"{}")
+    for name in ("fixer.safetensors", "fixer.card.json", "stage.json"):
+        (weights / "train-V9").mkdir(exist_ok=True)
+        (weights / "train-V9" / name).write_bytes(b"{}")
     files = files_of_the_wheel(tmp_path)
     assert "configs/fixers/weights/onefixer.safetensors" in files
     assert "configs/paper/small.yaml" in files

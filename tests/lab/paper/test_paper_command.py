@@ -3,6 +3,7 @@ another budget.
 """
 
 import json
+import shutil
 
 import pytest
 
@@ -32,6 +33,7 @@ training:
   columns: 4
 systems: [V9]
 ablation: [V2]
+times: {scenes: 2, frames: 5}
 pilot: {quality: pilot.json}
 """
 PILOT = {
@@ -88,7 +90,7 @@ def test_a_stopped_comparison_goes_on_and_another_budget_remakes_what_depends_on
     assert begun["quality-V9"] == "open"
 
     kept = tmp_path / "kept"
-    assert paper(tmp_path, "--json", "--keep-weights", str(kept)) == 0
+    assert paper(tmp_path, "--json", "--keep", str(kept)) == 0
     out, err = capsys.readouterr()
     said = err.replace("\n", "")
     record = json.loads(out)
@@ -110,28 +112,36 @@ def test_a_stopped_comparison_goes_on_and_another_budget_remakes_what_depends_on
     assert gap["comparisons"][0]["n"] == 2
     assert (tmp_path / "o" / "paper.md").read_text().count("| V2 |") == 1
 
-    assert sorted(path.name for path in kept.glob("*.safetensors")) == [
-        "V2.safetensors",
-        "V9.safetensors",
-    ]
-    assert paper(tmp_path, "--json", "--weights", str(kept)) == 0
-    repeated = json.loads(capsys.readouterr().out)
-    assert not [stage for stage in repeated["stages"] if stage["name"].startswith("train-")]
-    assert repeated["tables"]["cycle"]["V9"]["lpips"] == record["tables"]["cycle"]["V9"]["lpips"]
+    truths = list((tmp_path / "o" / "truth-rows").iterdir())
+    assert len(truths) == 2  # of two scenes, for three rows
+
+    shutil.rmtree(tmp_path / "o")
+    shutil.rmtree(kept / "quality-V2")
+    assert paper(tmp_path, "--json", "--keep", str(kept)) == 0
+    out, err = capsys.readouterr()
+    begun = [line.split()[1] for line in err.splitlines() if line.endswith(": begins")]
+    assert begun == ["scenes-test", "pairs-test", "quality-V2"]
+    again = json.loads(out)["tables"]["ablation"]["V2"]["lpips"]
+    assert again == record["tables"]["ablation"]["V2"]["lpips"]
 
     write_config(tmp_path, updates=STOP_AT + 1)
     changed = states(tmp_path, capsys)
     assert {name for name, state in changed.items() if state != "done"} == {
+        "scenes-train",  # not made again so far: nobody needed it
+        "pairs-train",
         "train-V9",
         "quality-V9",
+        "times",
     }
+    assert paper(tmp_path, "--weights", str(kept)) == InputError.exit_code
+    assert f"--steps {STOP_AT + 1}, kept {STOP_AT}" in capsys.readouterr().err
 
 
 def test_kept_weights_that_lack_a_system_are_refused(tmp_path, capsys):
     write_config(tmp_path, updates=1)
     assert paper(tmp_path, "--weights", str(tmp_path)) == InputError.exit_code
-    assert "no V9.safetensors" in capsys.readouterr().err
-    both = ("--weights", str(tmp_path), "--keep-weights", str(tmp_path))
+    assert "no " in capsys.readouterr().err
+    both = ("--weights", str(tmp_path), "--keep", str(tmp_path))
     assert paper(tmp_path, *both) == InputError.exit_code
 
 
@@ -144,10 +154,11 @@ def test_the_shipped_configurations_hold_every_row_of_the_papers_tables(name):
     assert list(config.drive.renderers) == list(tables["closed-loop"].rows)
 
 
-def test_the_renderers_of_the_closed_loop_are_understood():
+def test_the_renderers_of_the_closed_loop_are_understood(tmp_path):
     """Weights are only named here: what counts is that each name means its fixer and its steps."""
     config, _, _ = load_config("small")
-    drive = comparison(config, None, Effort())[-1]
+    stages = comparison(config, None, Effort(), tmp_path)
+    drive = next(stage for stage in stages if stage.name == "drive")
     words = drive.command[drive.command.index("--renderer") + 1]
     systems = {"difix": "difix", "omnidreams@4": "omnidreams@4", "self-forcing": "self-forcing"}
     systems["V9"] = "onefixer-dit-tiny"

@@ -7,7 +7,16 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InputError, Stopped
-from alpasim_plugin.lab.paper.stages import MARKER, Stage, place, run_stages
+from alpasim_plugin.lab.paper.stages import (
+    MARKER,
+    Stage,
+    keep_stage,
+    needed,
+    place,
+    restore,
+    run_stages,
+    why_not_restored,
+)
 
 DATA = Stage("data", ("make", "--out", "{out}"))
 NET = Stage("net", ("train", "{data}", "--steps", "3", "--out", "{out}"), ("data",))
@@ -25,6 +34,40 @@ def writer(calls):
         Path(folder).mkdir(parents=True, exist_ok=True)
 
     return execute
+
+
+def with_products(calls):
+    """Return an execution that also writes a net and a table."""
+    execute = writer(calls)
+
+    def produce(words):
+        execute(words)
+        (Path(words[words.index("--out") + 1]) / f"{words[0]}.safetensors").write_text(words[0])
+
+    return produce
+
+
+KEPT_STAGES = (
+    DATA,
+    replace(NET, products=("train.safetensors",)),
+    replace(TABLE, products=("measure.safetensors",)),
+)
+
+
+def run_and_keep(stages, out, kept, calls):
+    run_stages(
+        place(stages, out),
+        with_products(calls),
+        lambda *_: None,
+        lambda item: keep_stage(item, kept),
+    )
+
+
+def restored(stages, out, kept):
+    placed = place(stages, out)
+    for item in placed:
+        restore(item, kept)
+    return placed
 
 
 def keys(stages, out):
@@ -96,9 +139,35 @@ def test_a_stage_that_was_stopped_goes_on_and_is_not_taken_for_complete(tmp_path
     assert marker["was_resumed"] is True
 
 
+def test_a_kept_network_is_measured_elsewhere_without_training_or_its_data(tmp_path):
+    kept, calls = tmp_path / "kept", []
+    run_and_keep(KEPT_STAGES[:2], tmp_path / "here", kept, [])
+    there = restored(KEPT_STAGES, tmp_path / "there", kept)
+    assert [item.stage.name for item in needed(there)] == ["net", "table"]
+    run_and_keep(KEPT_STAGES, tmp_path / "there", kept, calls)
+    assert calls == ["measure"]
+    assert needed(restored(KEPT_STAGES, tmp_path / "third", kept)) == [
+        item for item in place(KEPT_STAGES, tmp_path / "third") if item.stage.name == "table"
+    ]
+
+
+def test_a_kept_network_of_another_budget_is_not_taken_and_the_difference_is_said(tmp_path):
+    kept = tmp_path / "kept"
+    run_and_keep(KEPT_STAGES[:2], tmp_path / "here", kept, [])
+    longer = replace(KEPT_STAGES[1], command=("train", "{data}", "--steps", "5", "--out", "{out}"))
+    _, net = restored((DATA, longer), tmp_path / "there", kept)
+    assert net.state == "open"
+    assert "--steps 5, kept 3" in why_not_restored(net, kept)
+    other_data = replace(DATA, command=("make", "--more", "--out", "{out}"))
+    _, net = restored((other_data, KEPT_STAGES[1]), tmp_path / "there", kept)
+    assert net.state == "open"
+    assert "on other weights or data" in why_not_restored(net, kept)
+    assert "no " in why_not_restored(net, tmp_path / "nothing")
+
+
 def test_a_marker_of_another_stage_is_refused(tmp_path):
     run_stages(place(STAGES, tmp_path), writer([]), lambda *_: None)
-    marker = place(STAGES, tmp_path)[0].folder / MARKER
+    marker = place(STAGES, tmp_path)[-1].folder / MARKER
     marker.write_text(json.dumps({"key": "0"}))
     with pytest.raises(InputError, match="key '0'"):
         run_stages(place(STAGES, tmp_path), writer([]), lambda *_: None)
