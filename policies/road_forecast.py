@@ -85,10 +85,17 @@ class RoadForecast:
 
     Args:
         lane_map: The map.
+        route_lanes: Lanes of who asks. At lines to give way at that name the lanes which go first,
+            others are expected to stop where these are among them.
     """
 
-    def __init__(self, lane_map: LaneMap) -> None:
+    def __init__(self, lane_map: LaneMap, route_lanes: Sequence[str] = ()) -> None:
         self._map = lane_map
+        self._stops = tuple(
+            line
+            for line in lane_map.give_way
+            if not line.yields_to or not set(line.yields_to).isdisjoint(route_lanes)
+        )
         self._index = LaneIndex(lane_map)
         self._ahead: dict[str, _LaneAhead] = {}
 
@@ -137,7 +144,7 @@ class RoadForecast:
             self._ahead[key] = _LaneAhead(
                 path,
                 lights_on(path, self._map.signals, lanes),
-                lights_on(path, self._map.give_way, lanes),
+                lights_on(path, self._stops, lanes),
             )
         return self._ahead[key]
 

@@ -131,12 +131,12 @@ class RuleBased(Policy):
         self.vehicle = scenario.vehicle
         self.front_m = self.vehicle.rear_axle_to_centre_m + self.vehicle.box.length_m / 2
         self._actors = scenario.actors
-        self._forecast = RoadForecast(scenario.lane_map)
 
     def reset(self, seed: int, route: Route) -> None:
         """Begin a drive along a route. Nothing is random."""
         self._route = route
         self._way: _Way | None = None
+        self._forecast = RoadForecast(self.lane_map, route.lane_ids)
         self._users = RoadUsers(self._actors)
 
     def act(self, observation: Observation) -> Plan:

@@ -1,5 +1,5 @@
 """What the country of a map decides where the map itself does not say it: the colour of the line
-between lanes of opposite directions.
+between lanes of opposite directions, and who goes first where roads cross without a sign.
 """
 
 import re
@@ -68,6 +68,13 @@ def centre_line(country: str | None) -> LaneMarkType:
     if country is None or country.upper() in YELLOW:
         return "double_yellow"
     return "dashed_white"
+
+
+def first_from_right(country: str | None) -> bool:
+    """Return whether, where no sign stands, who comes from the right goes first; in Japan who comes
+    from the left does (Road Traffic Act, article 36).
+    """
+    return country is None or country.upper() not in ("JP", "JPN")
 
 
 def country_at(lat_deg: float, lon_deg: float) -> str | None:

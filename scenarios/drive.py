@@ -252,6 +252,8 @@ def _signal(fields: JsonObject) -> Signal:
             "stop": _rows(fields["stop"]),
             "phases": phases,
             "lanes": tuple(fields["lanes"]),
+            "yields_to": tuple(fields.get("yields_to", ())),
+            "yields_to_waiting": tuple(fields.get("yields_to_waiting", ())),
             "head": None if head is None else np.array(head, dtype=np.float64),
         }
     )

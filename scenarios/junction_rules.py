@@ -31,7 +31,7 @@ def turning_lines(lights: Sequence[Signal], lanes: Mapping[str, Lane]) -> tuple[
         (light, key)
         for light in lights
         if not light.pedestrians
-        for key in dict.fromkeys(_through_junction(light, lanes))
+        for key in dict.fromkeys(through_junction(light, lanes))
     ]
     if not ways:
         return ()
@@ -41,14 +41,14 @@ def turning_lines(lights: Sequence[Signal], lanes: Mapping[str, Lane]) -> tuple[
     for first, second in meetings.T.tolist():
         light, key = ways[first]
         other, other_key = ways[second]
-        goes_second = _detour(lanes[key], key) > _detour(lanes[other_key], other_key)
-        meet = _is_level(middles[first], middles[second])
+        goes_second = detour(lanes[key], key) > detour(lanes[other_key], other_key)
+        meet = is_level(middles[first], middles[second])
         if meet and goes_second and _oncoming(light, other) and green_together(light, other):
             out[key] = Signal(light.stop, light.heading_rad, (), name=light.name, lanes=(key,))
     return tuple(out.values())
 
 
-def _through_junction(light: Signal, lanes: Mapping[str, Lane]) -> list[str]:
+def through_junction(light: Signal, lanes: Mapping[str, Lane]) -> list[str]:
     """Return the lanes of the junction behind the line of a light."""
     out: list[str] = []
     for key in (key for key in light.lanes if key in lanes):
@@ -57,14 +57,14 @@ def _through_junction(light: Signal, lanes: Mapping[str, Lane]) -> list[str]:
     return out
 
 
-def _detour(lane: Lane, key: str) -> tuple[bool, float, str]:
+def detour(lane: Lane, key: str) -> tuple[bool, float, str]:
     """Return what orders lanes that meet: whether one turns, its length, and its name for a tie."""
     ends = heading_of(np.diff(lane.centre[[0, 1, -2, -1]], axis=0)[[0, 2]])
     turns = abs(float(wrap_angle(ends[1] - ends[0]))) > STRAIGHT_RAD
     return turns, float(arc_lengths(lane.centre)[-1]), key
 
 
-def _is_level(middle: Any, other: Any) -> bool:
+def is_level(middle: Any, other: Any) -> bool:
     """Return whether lines in space are at one height where they are nearest in plan view."""
     ends = shapely.points(shapely.get_coordinates(shapely.shortest_line(middle, other)))
     lines = np.array([middle, other])

@@ -22,7 +22,7 @@ from alpasim_plugin.world.path import Path, smooth_path
 from alpasim_plugin.world.signals import lights_on
 from scenarios import lanelet2, opendrive
 from scenarios.build import TRACKED_EVERY, with_last
-from scenarios.countries import centre_line
+from scenarios.countries import centre_line, first_from_right
 from scenarios.ego_path import grid
 from scenarios.expert import Follower, drive
 from scenarios.junction_rules import turning_lines
@@ -33,6 +33,7 @@ from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
 from scenarios.street_map import CYCLE, Head, StreetMap, with_cycles
+from scenarios.unsigned_junctions import priority_lines
 from scenarios.variation import SceneDraft
 
 READERS = {"opendrive": opendrive.read_street, "lanelet2": lanelet2.read_street}
@@ -334,8 +335,10 @@ def _with_signals(
 
     heads = [head for head in street.heads if is_part(head.signal)]
     lights = _timed(heads, line, lane_map, front_m, cruise_mps)
-    signed = (signal for signal in street.give_way if is_part(signal))
-    give_way = (*signed, *turning_lines(lights, lane_map.lanes))
+    signed = [signal for signal in street.give_way if is_part(signal)]
+    from_right = first_from_right(street.country)
+    unlit = priority_lines(lane_map.lanes, lights, signed, from_right)
+    give_way = (*signed, *turning_lines(lights, lane_map.lanes), *unlit)
     return replace(lane_map, signals=lights, give_way=give_way), heads
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import LaneMap
+from alpasim_plugin.core.types import I64, LaneMap
 from alpasim_plugin.world.ground import STACKED_M
 from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
@@ -27,6 +27,7 @@ ROOM_M = 20.0  # between two vehicles at the start
 CLOSE_M = 2.0  # lines nearer than this meet
 HEAD_ON = -0.5  # cosine between two ways, below which they run against each other
 EVERY = 4  # vertex of a line, a metre apart, is looked at
+APART = 10  # such vertices on, ways that were close come together anew
 RULED_M = 60.0  # a rule is looked for so far before the place where they do
 SPEED_MPS = (7.0, 11.0)
 SLOWEST_MPS = 3.0  # whatever limits say
@@ -117,20 +118,39 @@ def _is_ruled(ride: _Ride, other: _Ride) -> bool:
     turned_rad = ride.path.yaw[::EVERY][close] - other.path.yaw[::EVERY][row[close]]
     if np.cos(turned_rad).min() < HEAD_ON:
         return False
+    places = np.split(close, np.flatnonzero(np.diff(close) > APART) + 1)
     if ride.way.lane_ids[0] in other.way.lane_ids or other.way.lane_ids[0] in ride.way.lane_ids:
-        return True
-    meets = [
-        (ride, ride.path.s[EVERY * close[0]]),
-        (other, other.path.s[EVERY * row[close].min()]),
-    ]
-    gives = [_before(meeting.give_way, s_m) is not None for meeting, s_m in meets]
-    first, second = (_before(meeting.lights, s_m) for meeting, s_m in meets)
+        places = places[1:]  # behind one another from the start
+    return all(_who_is_clear(ride, other, place, row[place]) for place in places)
+
+
+def _who_is_clear(ride: _Ride, other: _Ride, place: I64, other_place: I64) -> bool:
+    """Return whether a rule says who goes first where two ways come together.
+
+    Args:
+        ride, other: The ways.
+        place, other_place: Every `EVERY`-th vertex of each at the place.
+    """
+    s_m = float(ride.path.s[EVERY * place[0]])
+    other_s_m = float(other.path.s[EVERY * other_place.min()])
+    gives = _gives_way(ride, s_m, other), _gives_way(other, other_s_m, ride)
+    first = _before(ride.lights, s_m)
+    second = _before(other.lights, other_s_m)
     if first is not None and second is not None:
         return sum(gives) == 1 or not green_together(first.signal, second.signal)
     return sum(gives) == 1 and first is None and second is None
 
 
+def _gives_way(ride: _Ride, s_m: float, other: _Ride) -> bool:
+    """Return whether a line before a place holds a ride for another one."""
+    return any(
+        not line.signal.yields_to or not set(line.signal.yields_to).isdisjoint(other.way.lane_ids)
+        for line in ride.give_way
+        if 0.0 <= s_m - line.s_m <= RULED_M
+    )
+
+
 def _before(lines: tuple[LightAhead, ...], s_m: float) -> LightAhead | None:
-    """Return the last line before a place."""
+    """Return the last light before a place."""
     candidates = [line for line in lines if 0.0 <= s_m - line.s_m <= RULED_M]
     return candidates[-1] if candidates else None

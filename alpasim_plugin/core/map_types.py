@@ -77,6 +77,9 @@ class Signal:
     lanes: tuple[str, ...] = ()  # that it holds back, or that people cross
     pedestrians: bool = False  # it holds back people who cross, and no vehicle
     head: F64 | None = None  # (3,) metres, world: the middle of its lamps; None: not known
+    # of a line to give way at: lanes whose traffic goes first; empty: whoever comes
+    yields_to: tuple[str, ...] = ()
+    yields_to_waiting: tuple[str, ...] = ()  # those of them whose traffic goes first from rest too
 
     def colour_at(self, t_us: int) -> str:
         """Return the colour at a time.

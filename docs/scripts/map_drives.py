@@ -22,7 +22,7 @@ from pages import table
 from alpasim_plugin.core.files import file_sha256
 from alpasim_plugin.core.geometry import rectangle_corners, yaw_from_quat
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.types import Actor, RolloutLog, Scenario
+from alpasim_plugin.core.types import Actor, Frame, RenderRequest, RolloutLog, Scenario
 from alpasim_plugin.log.run_folder.rows import Rollout
 from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
@@ -48,6 +48,14 @@ TRIES = 20  # routes are drawn for each that shall pass a light
 CYCLES = 2  # of a light, for which a road user may stand
 
 
+class Nothing:
+    """The renderer of policies without a camera."""
+
+    def render(self, request: RenderRequest) -> Frame:
+        """Refuse to render."""
+        raise AssertionError(f"a frame of {request.camera.name} was asked for")
+
+
 @dataclass(frozen=True)
 class Drive:
     """How one drive ended, and what happened around it.
@@ -60,6 +68,7 @@ class Drive:
         vehicles: How many other road users there were.
         contacts: Pairs of them that touch at some step.
         jumps: Those whose speed changes at some step by more than tyres can.
+        hardest_mps2: The greatest change of speed among them, m/s^2.
         longest_stand_s: The longest time that a vehicle among them stands, seconds.
         cycle_s: The longest cycle of the lights, seconds; 0 without lights.
     """
@@ -72,6 +81,7 @@ class Drive:
     vehicles: int
     contacts: int
     jumps: int
+    hardest_mps2: float
     longest_stand_s: float
     cycle_s: float
 
@@ -83,8 +93,9 @@ class Drive:
 
 def drive(scenario: Scenario, policy: str) -> Drive:
     """Drive a scene once with a policy, and look at every step of the log."""
-    renderer = make_renderer("clean", scenario)
-    recorder = run_rollout(scenario, renderer, make_policy(policy, scenario))
+    driver = make_policy(policy, scenario)
+    renderer = make_renderer("clean", scenario) if driver.sensors else Nothing()
+    recorder = run_rollout(scenario, renderer, driver)
     log = recorder.log(images=False)
     _, scores = tabulate(log, score(log, scenario.scene, PRESET), PRESET)
     values = {name: metric.value for name, metric in scores.metrics.items() if metric.valid}
@@ -98,6 +109,7 @@ def drive(scenario: Scenario, policy: str) -> Drive:
         if touch(first, second)
     ]
     moves = [(actor, speeds(actor)) for actor in actors if len(actor.track) > 2]
+    changes = [hardest_mps2(*move) for move in moves]
     signals = scenario.lane_map.signals or ()
     return Drive(
         ending_of(rollout),
@@ -107,7 +119,8 @@ def drive(scenario: Scenario, policy: str) -> Drive:
         not all(is_held(scenario, log, t_us) for t_us in reds_us),
         len(actors),
         len(pairs),
-        sum(hardest_mps2(actor, speed_mps) > JUMP_MPS2 for actor, speed_mps in moves),
+        sum(change > JUMP_MPS2 for change in changes),
+        max(changes, default=0.0),
         max(
             (longest_stand_s(*move) for move in moves if move[0].label != "pedestrian"), default=0.0
         ),
@@ -238,6 +251,7 @@ def row_of(name: str, policy: str, drives: list[Drive]) -> list[str]:
         str(sum(part.vehicles for part in drives)),
         str(sum(part.contacts for part in drives)),
         str(sum(part.jumps for part in drives)),
+        f"{max(part.hardest_mps2 for part in drives):.1f}",
         f"{max(part.longest_stand_s for part in drives):.0f}",
         str(sum(part.stands_too_long for part in drives)),
     ]
@@ -245,7 +259,7 @@ def row_of(name: str, policy: str, drives: list[Drive]) -> list[str]:
 
 HEAD = [
     "map", "policy", "drives that ended", "`red_light`", "of them false", "other road users",
-    "pairs in contact", "jumps", "longest wait, s", "longer than two cycles",
+    "pairs in contact", "jumps", "hardest, m/s²", "longest wait, s", "longer than two cycles",
 ]  # fmt: skip
 
 if __name__ == "__main__":
