@@ -2,8 +2,8 @@
 gives are found here.
 
 An ego that is much slower than the recording is excused where it has a cause: a road user on the
-recorded path ahead of it or about to be there, a place at which the recording was slow as well, or
-the end of the path.
+recorded path ahead of it or about to be there, a traffic light there that is not green, a place at
+which the recording was slow as well, or the end of the path.
 """
 
 from __future__ import annotations
@@ -16,8 +16,18 @@ import numpy as np
 import shapely
 
 from alpasim_plugin.core.geometry import arc_lengths, inverse, offset_trajectory, speeds
+from alpasim_plugin.core.lights_passed import passings
 from alpasim_plugin.core.path_end import ends_with_path
-from alpasim_plugin.core.types import F64, I64, Bool, MetricSeries, RolloutLog, Scene, Trajectory
+from alpasim_plugin.core.types import (
+    F64,
+    I64,
+    Bool,
+    LaneMap,
+    MetricSeries,
+    RolloutLog,
+    Scene,
+    Trajectory,
+)
 from alpasim_plugin.log.run_folder.records import DriveEvent
 from evaluators.metrics.footprint import ActorTable, ego_footprints, origin_of
 from evaluators.metrics.motion import time_to_collision_s
@@ -262,7 +272,7 @@ def evaluate_outcomes(rollout: RolloutLog, scene: Scene, preset: Preset) -> list
         float(np.interp(t_us[0], path.t_us, arc_lengths(line))),
     )
     has_side = np.isfinite(on.lateral_m)
-    stalled, braked = _slow(rollout, preset, path, line, s)
+    stalled, braked = _slow(rollout, scene, preset, path, s)
     # Behind the end of the recording nothing drove on with which a slow ego could be compared.
     stalled &= ~on.is_beyond
     braked &= ~on.is_beyond
@@ -289,10 +299,12 @@ def _in_danger(rollout: RolloutLog, scene: Scene, preset: Preset) -> Bool:
 
 
 def _slow(
-    rollout: RolloutLog, preset: Preset, path: Trajectory, line: F64, s: F64
+    rollout: RolloutLog, scene: Scene, preset: Preset, path: Trajectory, s: F64
 ) -> tuple[Bool, Bool]:
     """Return at which steps ``(T,)`` the ego has stood too long, and has braked without a cause."""
     t_us = rollout.ego.t_us
+    origin = origin_of(rollout.ego_log, preset)
+    line = path.xyz[:, :2] - origin[:2]
     seconds = (t_us - t_us[0]) * 1e-6
     v = speeds(rollout.ego)
     engaged = t_us >= handover_us(rollout)
@@ -307,9 +319,9 @@ def _slow(
     steps_before_slow = np.flatnonzero(
         _recently((stands | slow)[::-1], -seconds[::-1])[::-1]
     )  # what comes before a slow step may excuse it
-    ahead[steps_before_slow] = actor_ahead(
-        rollout, preset, line, s, AHEAD_M + AHEAD_S * fastest, steps_before_slow
-    )
+    reach_m = AHEAD_M + AHEAD_S * fastest
+    ahead[steps_before_slow] = actor_ahead(rollout, preset, line, s, reach_m, steps_before_slow)
+    ahead |= light_ahead(scene.lane_map, path, t_us, s, reach_m)
     excused = _recently(ahead, seconds) | (s >= along[-1] - AHEAD_M)
     stood_s = _lasting(stands & ~excused, seconds)
     slow_s = _lasting(slow & ~excused, seconds)
@@ -376,6 +388,25 @@ def actor_ahead(
         gap_m = corners.max(axis=1) - s[step]
         near = (gap_m > 0.0) & (gap_m < reach_m[step] + boxes.size[:, 0])
         out[step[near]] = True
+    return out
+
+
+def light_ahead(lane_map: LaneMap, path: Trajectory, t_us: I64, s: F64, reach_m: F64) -> Bool:
+    """Return at which steps ``(T,)`` a traffic light that is not green holds who is on the recorded
+    path.
+
+    Args:
+        lane_map: The map, with its lights.
+        path: The recorded path.
+        t_us: ``(T,)`` times.
+        s: ``(T,)`` arc length of the ego on the path.
+        reach_m: ``(T,)`` how far ahead counts.
+    """
+    out = np.zeros(len(t_us), dtype=np.bool_)
+    for light in passings(path.xyz, lane_map.signals or (), lane_map.lanes, np.zeros(3)):
+        near = np.flatnonzero((light.s_m > s) & (light.s_m < s + reach_m))
+        colours = np.array([light.signal.colour_at(now) for now in t_us[near].tolist()])
+        out[near[colours != "green"]] = True
     return out
 
 

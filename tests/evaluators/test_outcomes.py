@@ -9,7 +9,16 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.geometry import inverse, offset_trajectory, quat_from_yaw
-from alpasim_plugin.core.types import Actor, Box, LaneMap, RolloutLog, Scene, Trajectory, Vehicle
+from alpasim_plugin.core.types import (
+    Actor,
+    Box,
+    LaneMap,
+    RolloutLog,
+    Scene,
+    Signal,
+    Trajectory,
+    Vehicle,
+)
 from alpasim_plugin.log.run_folder.rows import Rollout, rollouts_of_table
 from alpasim_plugin.log.run_folder.writer import rollout_table
 from alpasim_plugin.runs.scoring import tabulate
@@ -107,6 +116,28 @@ def test_a_leader_that_stands_is_a_cause():
     assert fired(track(x), None, leader) == set()
     beside = {"parked": track(np.full(len(T), x[-1] + 9.0), 6.0)}
     assert "stalled" in fired(track(x), None, beside)
+
+
+@pytest.mark.parametrize(
+    ("colour", "ahead_m", "had"),
+    [
+        ("red", 6.0, set()),
+        ("yellow", 6.0, set()),
+        ("green", 6.0, {"stalled", "braked_without_cause"}),
+        ("red", 60.0, {"stalled", "braked_without_cause"}),
+        ("red", -6.0, {"stalled", "braked_without_cause"}),
+    ],
+)
+def test_a_light_ahead_that_is_not_green_is_a_cause(colour, ahead_m, had):
+    """The recording met it at green."""
+    x = travelled(slowing(0.0))
+    log, scene = drive(track(x))
+    line_m = x[-1] + ahead_m
+    stop = np.array([[line_m, -2.0, 0.0], [line_m, 2.0, 0.0]])
+    light = Signal(stop, 0.0, ((colour, 60_000_000),))
+    scene = replace(scene, lane_map=LaneMap({}, (), signals=(light,)))
+    series = evaluate_outcomes(log, scene, PRESETS["strict"])
+    assert {metric.name for metric in series if bool(np.any(metric.value > 0))} == had
 
 
 def test_a_road_user_that_is_about_to_cross_is_a_cause():
