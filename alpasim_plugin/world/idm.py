@@ -232,42 +232,57 @@ def find_leaders(
     """
     if len(bodies.xy) == 0:  # an empty road: half of the calls of a built scene
         return [NO_LEADER] * len(line)
+    driver, body = _near(lines, line, front_s_m, bodies, horizon_m, own_row)
+    low, high = lines.stations(line, front_s_m - BEHIND_M, front_s_m + horizon_m)
+    reach_m = (half_width_m + margin_m)[driver]
+    pair_line = line[driver]
+    span = spans(lines, pair_line, bodies, body, low[driver], high[driver])
+    gap_m = span.rear - front_s_m[driver]
+    inside = (span.low < reach_m) & (span.high > -reach_m)
+    in_sight = span.on_level & (gap_m < horizon_m[driver])
+    ahead = inside & in_sight & (gap_m > -BESIDE_M)
+    if lets_merge:
+        nose_m = span.front - front_s_m[driver]
+        beside = np.flatnonzero(span.on_level & (gap_m <= -BESIDE_M) & (nose_m > 0.0))
+        yaw_and_velocity = (bodies.yaw[body[beside]], bodies.velocity[body[beside]])
+        near_m = _least_offsets(lines, pair_line[beside], span, beside, *yaw_and_velocity)
+        merging = beside[near_m < reach_m[beside]]
+        ahead[merging] = True
+        gap_m[merging] = np.where(inside[merging], gap_m[merging], nose_m[merging])
+        on_foot = bodies.half_length_m[body] < ON_FOOT_M
+        walkers = np.flatnonzero(on_foot & in_sight & ~inside & (gap_m > 0.0))
+        if len(walkers):
+            own_mps = np.where(own_row < 0, 0.0, np.hypot(*bodies.velocity[own_row].T))
+            arrives_s = gap_m[walkers] / np.maximum(own_mps[driver[walkers]], STANDS_MPS)
+            velocity = bodies.velocity[body[walkers]]
+            steps_s = _steps_in(lines, pair_line, span, walkers, reach_m, velocity)
+            ahead[walkers] = (steps_s < WALK_S) & (steps_s < arrives_s + CLEAR_S)
+    return _nearest(len(line), driver, body, gap_m, span.speed, ahead)
+
+
+def _near(
+    lines: Lines, line: I64, front_s_m: F64, bodies: Bodies, horizon_m: F64, own_row: I64
+) -> tuple[I64, I64]:
+    """Return the pairs ``(P,)`` of a driver and another body that is near enough to be looked at; see
+    `find_leaders`.
+    """
     start, _ = lines.at(line, front_s_m)
     delta = bodies.xy - start[:, None, :2]
     reaches = horizon_m[:, None] + bodies.half_length_m + 5.0
     near = np.hypot(delta[..., 0], delta[..., 1]) < reaches
     near[np.flatnonzero(own_row >= 0), own_row[own_row >= 0]] = False
     driver, body = np.nonzero(near)
-    low, high = lines.stations(line, front_s_m - BEHIND_M, front_s_m + horizon_m)
-    reach = half_width_m + margin_m
-    span = spans(lines, line[driver], bodies, body, low[driver], high[driver])
-    gap_m = span.rear - front_s_m[driver]
-    inside = (span.low < reach[driver]) & (span.high > -reach[driver])
-    ahead = inside & span.on_level & (gap_m > -BESIDE_M) & (gap_m < horizon_m[driver])
-    if lets_merge:
-        nose_m = span.front - front_s_m[driver]
-        beside = np.flatnonzero(span.on_level & (gap_m <= -BESIDE_M) & (nose_m > 0.0))
-        yaw_and_velocity = (bodies.yaw[body[beside]], bodies.velocity[body[beside]])
-        near_m = _least_offsets(lines, line[driver[beside]], span, beside, *yaw_and_velocity)
-        merges = near_m < reach[driver[beside]]
-        ahead[beside[merges]] = True
-        comes_in = merges & ~inside[beside]
-        gap_m[beside[comes_in]] = nose_m[beside[comes_in]]
-        on_foot = bodies.half_length_m[body] < ON_FOOT_M
-        walkers = np.flatnonzero(
-            on_foot & span.on_level & ~inside & (gap_m > 0.0) & (gap_m < horizon_m[driver])
-        )
-        if len(walkers):
-            own_mps = np.where(own_row < 0, 0.0, np.hypot(*bodies.velocity[own_row].T))
-            arrives_s = gap_m[walkers] / np.maximum(own_mps[driver[walkers]], STANDS_MPS)
-            steps_s = _steps_in(
-                lines, line[driver], span, walkers, reach[driver], bodies.velocity[body[walkers]]
-            )
-            ahead[walkers] = (steps_s < WALK_S) & (steps_s < arrives_s + CLEAR_S)
-    out = [NO_LEADER] * len(line)
+    return driver, body
+
+
+def _nearest(
+    n_drivers: int, driver: I64, body: I64, gap_m: F64, speed_mps: F64, ahead: Bool
+) -> list[Leader]:
+    """Return the nearest of the bodies that are ahead of each driver, by pairs ``(P,)``."""
+    out = [NO_LEADER] * n_drivers
     for k in np.lexsort((body, gap_m))[::-1]:  # the nearest last
         if ahead[k]:
-            out[driver[k]] = Leader(float(gap_m[k]), float(span.speed[k]), int(body[k]))
+            out[driver[k]] = Leader(float(gap_m[k]), float(speed_mps[k]), int(body[k]))
     return out
 
 
