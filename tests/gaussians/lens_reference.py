@@ -241,6 +241,22 @@ class LensReference:
         return colour, alpha, depth / alpha if alpha > 0 else 0.0
 
 
+    def image(self):
+        """Return `pixel` of all pixels through a global shutter: ``(H, W, 3)``, and ``(H, W)`` twice."""
+        x = np.einsum("nij,nj->ni", self.W, -self.splats.p)
+        e = np.einsum("nij,hwj->hwni", self.W, self.camera.rays())
+        along = np.maximum(-(e * x).sum(axis=-1) / (e * e).sum(axis=-1), 0.0)
+        q2 = ((x + along[..., None] * e) ** 2).sum(axis=-1)
+        alphas = np.minimum(ALPHA_MAX, self.splats.opacity * np.exp(-0.5 * q2))
+        alphas = np.where((alphas >= ALPHA_MIN) & self.camera.visible[..., None], alphas, 0.0)
+        through = np.cumprod(1 - alphas, axis=2)
+        before = np.concatenate([np.ones_like(through[..., :1]), through[..., :-1]], axis=2)
+        weights = np.where(through > TRANSMITTANCE_STOP, before * alphas, 0.0)
+        alpha = weights.sum(axis=2)
+        depth = weights @ self.splats.distance / np.where(alpha > 0, alpha, 1.0)
+        return weights @ self.splats.rgb, np.where(self.camera.visible, alpha, 1.0), depth
+
+
 def least_distance_along(S, p, o, d, far_m):
     """Return the least Mahalanobis distance, squared, of places of a ray, looked for along it."""
     W = np.linalg.inv(S)

@@ -38,7 +38,7 @@ _f = np.float32
 
 # Columns of a block in the backward pass: the above, then the sum S and the gradients of colour,
 # depth sum and alpha.
-_S, _GR, _GG, _GB, _GD, _GA, _BACK = range(32, 144, 16)
+BACK_S, BACK_R, BACK_G, BACK_B, BACK_D, BACK_A, BACK = range(32, 144, 16)
 # One row per (splat, tile) pair: gradients of colour and depth, then the moments of h: 1, s, t, s
 # s, s t, t t.
 PAIR_R, PAIR_G, PAIR_B, PAIR_Z, PAIR_H, PAIR_S, PAIR_T, PAIR_SS, PAIR_ST, PAIR_TT = range(10)
@@ -46,7 +46,7 @@ PAIR = 10
 
 
 @kernel
-def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth):
+def start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth):
     """Load a tile's state; return the bit mask of blocks where anything was drawn and the position
     behind the last splat drawn.
     """
@@ -55,7 +55,7 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
     end = 0
     for block in range(16):
         kept_offset = (tile * 16 + block) * KEPT
-        base = block * _BACK
+        base = block * BACK
         for pixel in range(16):
             x, y = pixel_of(tile_x, tile_y, block, pixel)
             block_offset = base + pixel
@@ -68,15 +68,15 @@ def _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_dep
                 live |= 1 << block
                 end = max(end, int(last) + 1)
                 (
-                    pixels[block_offset + _GR],
-                    pixels[block_offset + _GG],
-                    pixels[block_offset + _GB],
+                    pixels[block_offset + BACK_R],
+                    pixels[block_offset + BACK_G],
+                    pixels[block_offset + BACK_B],
                 ) = (
                     g_colour[y, x, 0],
                     g_colour[y, x, 1],
                     g_colour[y, x, 2],
                 )
-                pixels[block_offset + _GD], pixels[block_offset + _GA] = (
+                pixels[block_offset + BACK_D], pixels[block_offset + BACK_A] = (
                     g_depth[y, x],
                     g_alpha[y, x],
                 )
@@ -107,7 +107,7 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
         while todo != 0:
             block = v.lowest_bit(todo)
             todo &= todo - 1
-            base = block * _BACK
+            base = block * BACK
             x, y = block_centres(x0, y0, block)
             s, t = whitened(records, offset, x, y)
             exponent = v.fnma(s, s, v.fnma(t, t, records[offset + PEAK]))
@@ -118,16 +118,16 @@ def _tile_backward(first, end, lists, records, x0, y0, pixels, live, pairs):
             alpha = v.minimum(full, ALPHA_MAX)
             inverse = 1.0 / (1.0 - alpha)
             before = v.load(pixels, base + KEPT_T) * inverse
-            g_red = v.load(pixels, base + _GR)
-            g_green = v.load(pixels, base + _GG)
-            g_blue = v.load(pixels, base + _GB)
-            g_depth = v.load(pixels, base + _GD)
-            q = v.fma(records[offset + Z], g_depth, v.load(pixels, base + _GA))
+            g_red = v.load(pixels, base + BACK_R)
+            g_green = v.load(pixels, base + BACK_G)
+            g_blue = v.load(pixels, base + BACK_B)
+            g_depth = v.load(pixels, base + BACK_D)
+            q = v.fma(records[offset + Z], g_depth, v.load(pixels, base + BACK_A))
             q = v.fma(red, g_red, v.fma(green, g_green, v.fma(blue, g_blue, q)))
-            behind = v.load(pixels, base + _S)
+            behind = v.load(pixels, base + BACK_S)
             weight = before * alpha
             v.store(pixels, base + KEPT_T, before)
-            v.store(pixels, base + _S, v.fma(weight, q, behind))
+            v.store(pixels, base + BACK_S, v.fma(weight, q, behind))
             to_red = v.fma(weight, g_red, to_red)
             to_green = v.fma(weight, g_green, to_green)
             to_blue = v.fma(weight, g_blue, to_blue)
@@ -174,14 +174,14 @@ def tile_gradients(
         g_depth: float32 ``(H, W)``, gradient of the sum of weighted depths.
         pairs: float32 output, PAIR per entry of ``lists``, zero at the start.
     """
-    pixels = np.empty(16 * _BACK, dtype=np.float32)
+    pixels = np.empty(16 * BACK, dtype=np.float32)
     while True:
         tile = v.fetch_add(cursor, 0, 1)
         if tile >= starts.shape[0] - 1:
             return
         tile_x = tile % tiles_x
         tile_y = tile // tiles_x
-        live, end = _start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth)
+        live, end = start_backward(pixels, tile, tile_x, tile_y, kept, g_colour, g_alpha, g_depth)
         x0 = _f(tile_x * TILE) + _f(0.5)
         y0 = _f(tile_y * TILE) + _f(0.5)
         _tile_backward(starts[tile], end, lists, records, x0, y0, pixels, live, pairs)
@@ -189,7 +189,8 @@ def tile_gradients(
 
 @kernel
 def add_pairs(lists, pairs, sums):
-    """Add the rows of ``pairs`` to float64 ``sums (M, PAIR)``, by the splat that each is of."""
+    """Add the rows of ``pairs`` to ``sums (M, K)``, by the splat that each is of."""
+    columns = sums.shape[1]
     for i in range(lists.shape[0]):
-        for k in range(PAIR):
-            sums[lists[i], k] += pairs[i * PAIR + k]
+        for k in range(columns):
+            sums[lists[i], k] += pairs[i * columns + k]

@@ -57,6 +57,9 @@ from alpasim_plugin.gaussians.raster.project_kernels import dot, load3, row
 from alpasim_plugin.gaussians.raster.raster_kernels import (
     CHUNK,
     CUT,
+    KEPT,
+    KEPT_LAST,
+    KEPT_T,
     STATE,
     STATE_B,
     STATE_D,
@@ -183,13 +186,13 @@ def _q2(near, place, d):
 
 
 @kernel
-def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
+def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk, kept, at_kept):
     """Blend the splats of a chunk that touch a block; returns whether its pixels are finished.
 
     ``rolled`` is None of a global shutter, ``motion`` where all that is near moves evenly: a branch
-    for each splat would cost as much as the splat.
+    for each splat would cost as much as the splat. ``kept`` as of `composite_lens_tiles`.
     """
-    masks, near, size, state = chunk
+    masks, near, size, state, first = chunk
     base = block * STATE
     through = v.load(state, base + STATE_T)
     red = v.load(state, base + STATE_R)
@@ -210,7 +213,8 @@ def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
                 part * 16
             )
         while touching != 0:
-            place = (word * 64 + v.lowest_bit(touching)) * size
+            number = word * 64 + v.lowest_bit(touching)
+            place = number * size
             touching &= touching - 1
             if near[place + INVERSE_O2] < 0:
                 across, down = whitened(near, place, x, y)
@@ -222,8 +226,9 @@ def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
             else:
                 q2 = _q2(near, place, d)
             exponent = v.fnma(q2, Q2_SCALE, near[place + PEAK])
+            visible = exponent >= CUT
             alpha = v.minimum(falloff(exponent), ALPHA_MAX)
-            alpha = v.select(exponent >= CUT, alpha, 0.0)
+            alpha = v.select(visible, alpha, 0.0)
             after = v.fnma(through, alpha, through)
             goes_on = after > TRANSMITTANCE_STOP
             weight = v.select(goes_on, through * alpha, 0.0)
@@ -232,6 +237,10 @@ def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
             green = v.fma(weight, near[place + G], green)
             blue = v.fma(weight, near[place + B], blue)
             depth = v.fma(weight, near[place + DEPTH], depth)
+            if kept is not None:
+                last = v.load(kept, at_kept + KEPT_LAST)
+                last = v.select(goes_on & visible, first + number, last)
+                v.store(kept, at_kept + KEPT_LAST, last)
             if v.bits(through > 0.0) == 0:
                 finished = True
                 touching = 0
@@ -242,6 +251,8 @@ def _blend_block(block, x, y, rays, at_rays, rolled, lens, motion, chunk):
     v.store(state, base + STATE_G, green)
     v.store(state, base + STATE_B, blue)
     v.store(state, base + STATE_D, depth)
+    if kept is not None:
+        v.store(kept, at_kept + KEPT_T, v.absolute(through))
     return finished
 
 
@@ -279,9 +290,12 @@ def _composite_tile(
     live,
     corner,
     room,
+    kept,
+    at_kept,
 ):
     """Blend a tile's splats in order. ``corner`` is the centre of its first pixel; ``room`` is the
-    state, and that for a chunk of splats: their records, and which blocks they touch.
+    state, and that for a chunk of splats: their records, and which blocks they touch. ``kept`` as of
+    `composite_lens_tiles`.
     """
     state, near, masks = room
     x0, y0 = corner
@@ -315,21 +329,30 @@ def _composite_tile(
             block = v.lowest_bit(todo)
             todo &= todo - 1
             place = at_rays + block * 48
-            chunk = masks, near, size, state
+            chunk = masks, near, size, state, first - start
+            block_kept = at_kept + block * KEPT
             x, y = block_centres(x0, y0, block)
             if motion is None:
-                finished = _blend_block(block, x, y, rays, place, None, lens, None, chunk)
+                finished = _blend_block(
+                    block, x, y, rays, place, None, lens, None, chunk, kept, block_kept
+                )
             elif is_even:
-                finished = _blend_block(block, x, y, rays, place, rolled, lens, None, chunk)
+                finished = _blend_block(
+                    block, x, y, rays, place, rolled, lens, None, chunk, kept, block_kept
+                )
             else:
-                finished = _blend_block(block, x, y, rays, place, rolled, lens, motion, chunk)
+                finished = _blend_block(
+                    block, x, y, rays, place, rolled, lens, motion, chunk, kept, block_kept
+                )
             if finished:
                 live &= ~(1 << block)
 
 
 @kernel
 def _write_tile(tile_x, tile_y, state, alive, at_alive, behind, colour, alpha, depth_sum):
-    """Write a tile's pixels; those in which the lens sees nothing are black and opaque."""
+    """Write a tile's pixels; those in which the lens sees nothing are black and opaque. Without a
+    background, sums of weighted colours and depths.
+    """
     height, width = alpha.shape
     for line in range(min(TILE, height - tile_y * TILE)):
         y = tile_y * TILE + line
@@ -345,11 +368,17 @@ def _write_tile(tile_x, tile_y, state, alive, at_alive, behind, colour, alpha, d
             place = block * STATE + pixel
             opacity = _f(1.0) - abs(state[place + STATE_T])
             alpha[y, x] = opacity
-            depth_sum[y, x] = state[place + STATE_D] / opacity if opacity > 0 else _f(0.0)
+            depth = state[place + STATE_D]
+            if behind is not None:
+                depth = depth / opacity if opacity > 0 else _f(0.0)
+            depth_sum[y, x] = depth
             for channel in range(3):
-                back = behind[min(y, behind.shape[0] - 1), min(x, behind.shape[1] - 1), channel]
-                light = state[place + STATE_R + 16 * channel] + (_f(1.0) - opacity) * back
-                colour[y, x, channel] = min(max(light, _f(0.0)), _f(1.0))
+                light = state[place + STATE_R + 16 * channel]
+                if behind is not None:
+                    back = behind[min(y, behind.shape[0] - 1), min(x, behind.shape[1] - 1), channel]
+                    light = light + (_f(1.0) - opacity) * back
+                    light = min(max(light, _f(0.0)), _f(1.0))
+                colour[y, x, channel] = light
 
 
 @kernel
@@ -364,6 +393,7 @@ def composite_lens_tiles(
     blocks,
     lens,
     motion,
+    kept,
     behind,
     colour,
     alpha,
@@ -377,10 +407,13 @@ def composite_lens_tiles(
         rays, alive, blocks: See `lens_rays.TileRays`.
         lens: float64 ``(LENS_SIZE,)``.
         motion: float32, `MOTION` numbers a moving node; None: the shutter is global.
-        behind: float32 ``(H, W, 3)`` or ``(1, 1, 3)``, the background.
-        colour: float32 output ``(H, W, 3)``, 0..1.
+        kept: float32 output, 16 x KEPT per tile, for `lens_gradient_kernels.lens_tile_gradients`, or
+            None.
+        behind: float32 ``(H, W, 3)`` or ``(1, 1, 3)``, the background; or None.
+        colour: float32 output ``(H, W, 3)``, 0..1; without a background the sum of weighted colours.
         alpha: float32 output ``(H, W)``.
-        depth: float32 output ``(H, W)``, mean distance of the Gaussians' means, metres.
+        depth: float32 output ``(H, W)``, mean distance of the Gaussians' means, metres; without a
+            background the sum of weighted distances.
     """
     near = np.empty(CHUNK * (LONG if motion is not None else SHORT), dtype=np.float32)
     room = np.empty(16 * STATE, dtype=np.float32), near, np.empty(CHUNK, dtype=np.int32)
@@ -398,6 +431,12 @@ def composite_lens_tiles(
         span = lists, starts[tile], starts[tile + 1], records, rays, at_rays
         x0 = _f(tile_x * TILE) + _f(0.5)
         y0 = _f(tile_y * TILE) + _f(0.5)
+        at_kept = tile * 16 * KEPT
+        if kept is not None:
+            for place in range(at_kept, at_kept + 16 * KEPT, KEPT):
+                v.store(kept, place + KEPT_T, v.splat(_f(1.0)))
+                v.store(kept, place + KEPT_LAST, v.splat(_f(-1.0)))
+        kept_tile = (x0, y0), room, kept, at_kept
         if motion is not None:
             first_x = v.lane_pattern(_f(4.0), _f(0.0)) + x0
             first_y = v.lane_pattern(_f(0.0), _f(4.0)) + y0
@@ -405,8 +444,8 @@ def composite_lens_tiles(
             for block in range(16):
                 x, y = block_centres(x0, y0, block)
                 _roll_pixels(rays, at_rays + block * 48, x, y, lens, rolled, block)
-            _composite_tile(*span, rolled_blocks, 0, rolled, lens, motion, live, (x0, y0), room)
+            _composite_tile(*span, rolled_blocks, 0, rolled, lens, motion, live, *kept_tile)
         else:
-            _composite_tile(*span, blocks, at_blocks, rolled, lens, motion, live, (x0, y0), room)
+            _composite_tile(*span, blocks, at_blocks, rolled, lens, motion, live, *kept_tile)
         at_alive = tile * 256
         _write_tile(tile_x, tile_y, room[0], alive, at_alive, behind, colour, alpha, depth)

@@ -61,12 +61,37 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     """
     cloud.require_drawable()
     index = np.flatnonzero(cloud.opacities >= ALPHA_MIN)
-    n = len(index)
-    size = cloud.sh.shape[1]
     kept = cloud.take(index)
-    opacity = kept.opacities.astype(np.float64)
-    geometry = np.zeros((n, GEO_SIZE), dtype=np.float32)
     factor = kept.rotations() * kept.scales.astype(np.float64)[:, None, :]
+    return packed(
+        len(cloud), index, kept.means, factor, kept.opacities, kept.sh, cloud.antialias_px2
+    )
+
+
+def packed(
+    n_input: int,
+    index: I64,
+    means: FloatArray,
+    factor: F64,
+    opacities: FloatArray,
+    sh: FloatArray,
+    antialias_px2: float = 0.0,
+) -> PreparedCloud:
+    """Return Gaussians as the kernels read them.
+
+    Args:
+        n_input: Gaussians of the cloud that they are chosen from.
+        index: ``(N,)`` their positions in it.
+        means: ``(N, 3)``.
+        factor: ``(N, 3, 3)`` whose product with its transpose is the covariance.
+        opacities: ``(N,)`` at the alpha cut or above.
+        sh: ``(N, K, 3)``.
+        antialias_px2: See `GaussianCloud`.
+    """
+    n = len(index)
+    size = sh.shape[1]
+    opacity = opacities.astype(np.float64)
+    geometry = np.zeros((n, GEO_SIZE), dtype=np.float32)
     geometry[:, GEO_FACTOR : GEO_FACTOR + 9] = factor.reshape(n, 9)
     geometry[:, GEO_PEAK] = (np.log2(opacity) + 4.0) / 8.0
     extent = np.sqrt(2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0)))
@@ -74,13 +99,13 @@ def prepare(cloud: GaussianCloud) -> PreparedCloud:
     # A mean of NaN in the lanes that fill up the last group fails every comparison, so they are
     # never drawn.
     return PreparedCloud(
-        len(cloud),
+        n_input,
         size,
-        _in_lanes(kept.means.astype(np.float64), np.nan),
+        _in_lanes(means.astype(np.float64), np.nan),
         _in_lanes(geometry, 0.0),
-        _in_lanes(kept.sh.reshape(n, size * 3).astype(np.float32), 0.0),
+        _in_lanes(sh.reshape(n, size * 3).astype(np.float32), 0.0),
         np.concatenate([index, np.zeros(-n % _LANES, dtype=np.int64)]).astype(np.int64),
-        cloud.antialias_px2,
+        antialias_px2,
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from alpasim_plugin.core.devices import upload
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.camera import PinholeCamera, Posed
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.constants import (
     ALPHA_MIN,
@@ -35,6 +35,7 @@ from alpasim_plugin.gaussians.constants import (
     V,
     Z,
 )
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.raster.gradient_kernels import (
     PAIR,
     PAIR_H,
@@ -97,7 +98,8 @@ class GradientOutput:
     Attributes:
         rgb: ``(H, W, 3)``, background included, not clamped.
         alpha: ``(H, W)`` accumulated opacity.
-        depth: ``(H, W)`` metres along the optical axis, alpha-weighted mean; 0 where alpha is 0.
+        depth: ``(H, W)`` metres along the optical axis, of a lens from the camera's centre,
+            alpha-weighted mean; 0 where alpha is 0.
         index: ``(M,)`` the Gaussians that may reach the image, nearest first; on a GPU all of them,
             whose number the host knows.
         uv: ``(M, 2)`` their centres, pixels; keeps its gradient.
@@ -116,7 +118,7 @@ class GradientOutput:
 
 def rasterize_gradient(
     splats: Splats,
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     *,
     background: Tensor | None = None,
     near_m: float = NEAR_M,
@@ -132,7 +134,7 @@ def rasterize_gradient(
 
     Args:
         splats: What to draw; tensors of the compositor's device.
-        camera: From where.
+        camera: From where; through a lens by the rule of `rasterize_lens`, on the CPU alone.
         background: ``(3,)`` or ``(H, W, 3)``, 0..1; None is black. May require gradients.
         near_m: Gaussians whose centre is nearer are left out.
         threads: CPU threads; None takes ``numba.get_num_threads()``. Neither image nor gradients
@@ -141,6 +143,9 @@ def rasterize_gradient(
 
     Returns:
         The image with its graph; second derivatives are not available.
+
+    Raises:
+        InputError: A lens on a GPU, or one with a rolling shutter.
 
     Example:
         >>> import numpy as np, torch
@@ -154,13 +159,15 @@ def rasterize_gradient(
         >>> bool(splats.means.grad[0, 0] < 0), out.uv.grad.shape
         (True, torch.Size([1, 2]))
     """
+    if isinstance(camera, LensCamera):
+        return _through_lens(splats, camera, background, near_m, threads, compositor)
     candidates = _candidates_of(splats, camera, near_m, all_of_them=compositor is not None)
     local = candidates.local
     uv, m, n = _ellipses(local, candidates.splats, camera)
     if uv.requires_grad:
         uv.retain_grad()
     log_opacity = torch.nn.functional.logsigmoid(candidates.splats.logit_opacities)
-    colours = _colours(local, candidates.splats.sh, camera)
+    colours = colours_of(local, candidates.splats.sh, camera)
     projected = (uv, m, n, log_opacity, colours, local[2])
     with torch.no_grad():
         scale = EXPONENT_SCALE if compositor is None else 1.0
@@ -176,6 +183,27 @@ def rasterize_gradient(
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     return GradientOutput(rgb, alpha, depth, candidates.index, uv, on_screen, pairs)
+
+
+def _through_lens(
+    splats: Splats,
+    camera: LensCamera,
+    background: Tensor | None,
+    near_m: float,
+    threads: int | None,
+    compositor: TileCompositor | None,
+) -> GradientOutput:
+    if compositor is not None:
+        raise InputError(
+            "a camera with a lens: a GPU fits to images of pinholes alone",
+            "fit on the cpu, or free the photographs of their distortion first",
+        )
+    # Its kernels are looked up only where somebody fits through a lens.
+    from alpasim_plugin.gaussians.raster.rasterize_lens_gradient import rasterize_lens_gradient
+
+    return rasterize_lens_gradient(
+        splats, camera, background=background, near_m=near_m, threads=threads
+    )
 
 
 @dataclass(frozen=True)
@@ -222,7 +250,7 @@ def _reaches_the_image(records: Tensor, camera: PinholeCamera) -> Tensor:
     return ((centre + reach >= 0.5) & (centre - reach <= last)).all(dim=1)
 
 
-def _colours(local: Tensor, sh: Tensor, camera: PinholeCamera) -> Tensor:
+def colours_of(local: Tensor, sh: Tensor, camera: Posed) -> Tensor:
     """Return the colours ``(N, 3)`` from the camera's side, clamped at 0 below.
 
     Args:
@@ -343,7 +371,7 @@ def _ellipses(
     return uv, turned(j) * scales, turned(k) * scales
 
 
-def _covariance(m: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def screen_covariance(m: Tensor, n: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return C11, C12, C22 and the determinant of the screen covariance ``(M,)``.
 
     The determinant is a sum of squares (Cauchy-Binet), which does not cancel for needles.
@@ -365,7 +393,7 @@ def _records(
     """Return projected splats ``(M, RECORD)`` as the kernels read them: see `constants`; the
     whitening times a scale.
     """
-    c11, c12, c22, det = _covariance(m, n)
+    c11, c12, c22, det = screen_covariance(m, n)
     extent = (2 * (log_opacity - np.log(ALPHA_MIN))).clamp(min=0).sqrt().clamp(max=EXTENT_MAX_SIGMA)
     radius_x = extent * c11.sqrt()
     radius_y = extent * c22.sqrt()
@@ -466,7 +494,7 @@ class _Composite(torch.autograd.Function):
         """
         m, n, colour = ctx.saved_tensors
         sums = ctx.sums(*gradients).T.contiguous()
-        _, c12, c22, det = _covariance(m, n)
+        _, c12, c22, det = screen_covariance(m, n)
         # The moments are over whitened coordinates times the scale: each w holds one.
         w11 = (c22 / det).sqrt() / ctx.scale
         w22 = c22.rsqrt() / ctx.scale

@@ -64,8 +64,46 @@ def rasterize_lens(
         lens sees nothing it is black and opaque.
     """
     behind = background_image(background, camera)
+    drawn = drawn_splats(nodes, camera, near_m=near_m, threads=threads, starts=starts)
+    return RasterOutput(*composite_lens(drawn, camera, None, behind, threads))
+
+
+class DrawnSplats(NamedTuple):
+    """The splats that reach an image: see `lens_project_kernels.project_lens_part`."""
+
+    records: F32
+    size: int
+    boxes: npt.NDArray[np.int16]
+    keys: F32
+    ids: I64
+
+
+class DrawnTiles(NamedTuple):
+    """What the tiles of an image are composited of.
+
+    Attributes:
+        splats: Their records.
+        tiles: Which of them each tile may show.
+        lens: See `lens_rays.camera_lens`.
+        motion: See `_motions`.
+    """
+
+    splats: DrawnSplats
+    tiles: TileLists
+    lens: F64
+    motion: F32 | None
+
+
+def drawn_splats(
+    nodes: Sequence[Node],
+    camera: LensCamera,
+    *,
+    near_m: float,
+    threads: int,
+    starts: Sequence[F64 | None] = (),
+) -> DrawnTiles:
+    """Project the Gaussians of several prepared clouds and list those that each tile may show."""
     lens = camera_lens(camera)
-    table_of_rays = tile_rays(camera)
     poses = node_poses([T for _, T in nodes], camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
     numbers, moved, motion = _motions(nodes, starts, camera, poses, lens)
@@ -92,27 +130,40 @@ def rasterize_lens(
     run_on_threads(threads if room > WORTH_THREADS else 1, project)
     count = int(cursor[0])
     splats = DrawnSplats(records, size, boxes[:count], keys[:count], ids[:count])
-    tiles = _listed(splats, camera, table_of_rays, lens, motion, threads)
+    tiles = _listed(splats, camera, tile_rays(camera), lens, motion, threads)
+    return DrawnTiles(splats, tiles, lens, motion)
+
+
+def composite_lens(
+    drawn: DrawnTiles, camera: LensCamera, kept: F32 | None, behind: F32 | None, threads: int
+) -> tuple[F32, F32, F32]:
+    """Return colour ``(H, W, 3)``, alpha and depth ``(H, W)``: see `composite_lens_tiles`."""
+    tiles = drawn.tiles
+    table = tile_rays(camera)
     shape = (camera.height, camera.width)
     colour = np.empty((*shape, 3), dtype=np.float32)
     alpha = np.empty(shape, dtype=np.float32)
     depth = np.empty(shape, dtype=np.float32)
-    lists = (np.zeros(1, dtype=np.int64), tiles.columns, tiles.starts, tiles.lists, records)
-    rays = (table_of_rays.rays, table_of_rays.alive, table_of_rays.blocks, lens)
     run_on_threads(
-        threads, composite_lens_tiles, *lists, *rays, motion, behind, colour, alpha, depth
+        threads,
+        composite_lens_tiles,
+        np.zeros(1, dtype=np.int64),
+        tiles.columns,
+        tiles.starts,
+        tiles.lists,
+        drawn.splats.records,
+        table.rays,
+        table.alive,
+        table.blocks,
+        drawn.lens,
+        drawn.motion,
+        kept,
+        behind,
+        colour,
+        alpha,
+        depth,
     )
-    return RasterOutput(colour, alpha, depth)
-
-
-class DrawnSplats(NamedTuple):
-    """The splats that reach an image: see `lens_project_kernels.project_lens_part`."""
-
-    records: F32
-    size: int
-    boxes: npt.NDArray[np.int16]
-    keys: F32
-    ids: I64
+    return colour, alpha, depth
 
 
 def _listed(
