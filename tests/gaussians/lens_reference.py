@@ -240,7 +240,6 @@ class LensReference:
         alpha = 1 - through
         return colour, alpha, depth / alpha if alpha > 0 else 0.0
 
-
     def image(self):
         """Return `pixel` of all pixels through a global shutter: ``(H, W, 3)``, and ``(H, W)`` twice."""
         x = np.einsum("nij,nj->ni", self.W, -self.splats.p)

@@ -19,7 +19,7 @@ ellipse of the image has the residual (s, t, 0) from its centre to the pixel.
 import numpy as np
 
 from alpasim_plugin.core.kernels import kernel
-from alpasim_plugin.gaussians.constants import ALPHA_MAX, EXPONENT_SCALE, TILE, B, G, R
+from alpasim_plugin.gaussians.constants import ALPHA_MAX, EXPONENT_SCALE, TILE, R
 from alpasim_plugin.gaussians.raster import simd as v
 from alpasim_plugin.gaussians.raster.gradient_kernels import (
     BACK,

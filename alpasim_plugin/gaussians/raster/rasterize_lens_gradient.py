@@ -70,9 +70,7 @@ def rasterize_lens_gradient(
         )
     workers = thread_count(threads)
     with torch.no_grad():
-        drawn = drawn_splats(
-            [(_prepared(splats), None)], camera, near_m=near_m, threads=workers
-        )
+        drawn = drawn_splats([(_prepared(splats), None)], camera, near_m=near_m, threads=workers)
     view = _LensView(drawn, camera, workers)
     index = torch.from_numpy(drawn.splats.ids)
     chosen = Splats(*(tensor.index_select(0, index) for tensor in splats))
@@ -141,9 +139,7 @@ class _Projected(NamedTuple):
     distance: Tensor
 
 
-def _projected(
-    splats: Splats, camera: LensCamera, drawn: DrawnTiles
-) -> tuple[_Projected, Tensor]:
+def _projected(splats: Splats, camera: LensCamera, drawn: DrawnTiles) -> tuple[_Projected, Tensor]:
     """Return the projection of drawn splats with its graph, and the places of their means in the image
     ``(M, 2)``, whose gradient is that of moving the splats across the lines of sight.
     """
@@ -196,7 +192,9 @@ def _pixel_steps(place: LensPlace) -> Tensor:
     return torch.stack([to_right, to_down, along], dim=1)
 
 
-Images = tuple[Tensor, Tensor, Tensor]  # sums of weighted colours, alpha, sums of weighted distances
+Images = tuple[
+    Tensor, Tensor, Tensor
+]  # sums of weighted colours, alpha, sums of weighted distances
 
 
 class _LensView:
