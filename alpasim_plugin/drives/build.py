@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import projected
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import content_of, read_json, read_json_object
@@ -40,6 +41,7 @@ from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, resized
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.scene.log_views import actors_at
 from scenarios.drive import MODEL_FOLDER, TRANSFORMS_FILE, read_drive, write_drive
 from scenarios.map_lines import corridor
@@ -55,6 +57,10 @@ RENDER_PX = 640  # most of the longer side of the scenario's cameras
 SIDE_PX = 16  # what the sides of these cameras are multiples of, as fixers need
 SEED = 0  # of the fit
 SHORT_US = 2_000_000  # a shorter log is driven from its first pose on
+STRAIGHT_ON_GPU = (
+    "photographs with distortion were freed of it before the fit, which cuts their borders: a GPU draws "
+    "pinholes alone, --device cpu fits whole photographs"
+)
 THIN_MODEL_HINT = (
     "Check that the poses belong to the photographs, and give photographs that overlap and show the "
     "road: a policy would drive through nothing."
@@ -85,9 +91,12 @@ class PlacedPhotograph:
         """Return its name as a view: camera and number, which sorts along the way."""
         return f"{self.camera}-{Path(self.file).stem}"
 
-    def view(self) -> PosedView:
-        """Return it as a view of the width that is fitted."""
-        full = replace(self.source, T_world_camera=self.T_world_camera).view()
+    def view(self, through_lens: bool) -> PosedView:
+        """Return it as a view of the width that is fitted: whole, through its lens, or without its
+        distortion.
+        """
+        placed = replace(self.source, T_world_camera=self.T_world_camera)
+        full = placed.whole_view() if through_lens else placed.view()
         whole = full.camera.width
         width = max(min(whole, FIT_PX * whole // max(whole, full.camera.height)), -(-whole // 2))
         small = resized(full, width + width % 2) if width < full.camera.width else full
@@ -185,13 +194,16 @@ def _built(
     )
     drive = replace(drive, notes=(*drive.notes, *notes))
     photographs = placed_photographs(drive, placed, stride)
+    through_lens = device.partition(":")[0] == "cpu"
+    if not through_lens and any(photograph.source.lens.bends for photograph in photographs):
+        drive = replace(drive, notes=(*drive.notes, STRAIGHT_ON_GPU))
     begin(work, key)
     write_photographs(work, photographs, tell)
     actors = placed.actors
     views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
     for photograph in photographs:
         present = actors_at(actors, int(photograph.source.t_us or 0))
-        views[photograph.use].append(replace(photograph.view(), actors=present))
+        views[photograph.use].append(replace(photograph.view(through_lens), actors=present))
     visible_ids = {name for view in views["fitted"] for name in _in_view(view)}
     near = placed.points.chosen(placed.points.spread < np.percentile(placed.points.spread, 90))
     done = fit_drive(
@@ -457,7 +469,14 @@ def _in_view(view: PosedView) -> list[str]:
     camera = view.camera
     visible_ids = []
     for name, T in view.actors.items():
-        x, y, depth = (camera.T_camera_world @ T[:, 3])[:3]
+        middle = (camera.T_camera_world @ T[:, 3])[:3]
+        if isinstance(camera, LensCamera):
+            pixel, is_described = projected(camera.spec, middle[None])
+            inside = (pixel >= 0) & (pixel < [camera.width, camera.height])
+            if is_described[0] and inside.all():
+                visible_ids.append(name)
+            continue
+        x, y, depth = middle
         column = camera.fx * x / depth + camera.cx
         row = camera.fy * y / depth + camera.cy
         if depth > 0 and 0 <= column < camera.width and 0 <= row < camera.height:

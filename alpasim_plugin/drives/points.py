@@ -82,7 +82,7 @@ def placed(tracks: Tracks, views: Sequence[PosedView]) -> Points:
     """Place tracks, and return the points that at least three views place alike, with how well each
     is known.
     """
-    cameras = [view.camera for view in views]
+    cameras = [view.pinhole for view in views]
     if tracks.count:  # observations that do not fit are left out once
         tracks = tracks.only(place(tracks, cameras).error_px < 3 * ERROR_PX)
     if not tracks.count:
@@ -175,7 +175,7 @@ def agreeing(first: PosedPhotograph, second: PosedPhotograph, turns: Sequence[F6
             PinholeCamera(
                 camera.width, camera.height, camera.K, inverse(turn) @ camera.T_camera_world
             )
-            for camera in (view.camera for view in views)
+            for camera in (view.pinhole for view in views)
         ]
         error = place(tracks, turned).error_px.reshape(-1, 2)
         counts.append(int((error < ERROR_PX).all(axis=1).sum()))
@@ -211,7 +211,7 @@ def road_points(photographs: Sequence[PosedPhotograph], poses: F64, strip: Groun
         small_view(replace(photograph, T_world_camera=pose))
         for photograph, pose in zip(photographs, poses, strict=True)
     ]
-    shots = [(view.camera, cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)) for view in views]
+    shots = [(view.pinhole, cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)) for view in views]
     rows = [np.zeros((0, 4))]
     count = 0
     for i in range(len(shots) - 1):

@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.fit.lens import gain_near
 from alpasim_plugin.gaussians.fit.quality import Comparison
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
 LATERAL_M = (0.0, 1.0, -1.0, 2.0, -2.0)  # to the left of the path
@@ -84,7 +85,14 @@ def _compared(graph: SceneGraph, view: PosedView, gain: F32) -> Comparison:
     present = {name: T for name, T in view.actors.items() if name in graph.actors}
     out = graph.render(view.camera, present)
     image = out.exposed(gain).to_uint8()
-    return Comparison(view.name, image, view.rgb, psnr_db(image, view.rgb), ssim(image, view.rgb))
+    truth = view.rgb
+    if view.mask is None:
+        return Comparison(view.name, image, truth, psnr_db(image, truth), ssim(image, truth))
+    # What a lens does not describe counts in neither number.
+    image[~view.mask] = truth[~view.mask]
+    share = float(view.mask.mean())
+    psnr = psnr_db(image[view.mask], truth[view.mask])
+    return Comparison(view.name, image, truth, psnr, 1 - (1 - ssim(image, truth)) / share)
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -133,7 +141,12 @@ def _covered(graph: SceneGraph, view: PosedView, offset: F64) -> float:
     shift = shifted(*offset)
     pose = inverse(view.camera.T_camera_world)
     camera = replace(view.camera, T_camera_world=inverse(shift @ pose))
-    return float((graph.render(camera, {}).alpha[camera.height // 2 :] > OPAQUE).mean())
+    covered = graph.render(camera, {}).alpha > OPAQUE
+    lower = np.zeros(covered.shape, dtype=np.bool_)
+    lower[camera.height // 2 :] = True
+    if isinstance(camera, LensCamera):
+        lower &= camera.visible
+    return float(covered[lower].mean())
 
 
 def write_page(

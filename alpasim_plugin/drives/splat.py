@@ -102,7 +102,11 @@ def import_splat(
         photographs = placed_photographs(drive, placed, stride) if has_photographs else []
         write_photographs(work, photographs, tell)
         views = {
-            use: [photograph.view() for photograph in photographs if photograph.use == use]
+            use: [
+                photograph.view(through_lens=True)
+                for photograph in photographs
+                if photograph.use == use
+            ]
             for use in ("fitted", "held-out", "never-fitted")
         }
         if not has_photographs:

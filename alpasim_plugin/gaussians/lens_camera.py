@@ -10,7 +10,7 @@ import numpy as np
 from alpasim_plugin.cameras.image_map import ImageMap, image_map, with_lens
 from alpasim_plugin.cameras.lens import Rays, rays_at, rays_of
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import F64, Bool, CameraSpec, LensModel
+from alpasim_plugin.core.types import F64, I64, Bool, CameraSpec, LensModel
 from alpasim_plugin.gaussians.camera import Posed, Rolling
 from alpasim_plugin.gaussians.cloud import require_rigid
 
@@ -78,6 +78,12 @@ class LensCamera(Posed):
     def rays(self) -> F64:
         """Return the directions ``(H, W, 3)`` of unit length of the pixels, in the camera's axes."""
         return lens_rays(self.spec).ray.reshape(self.height, self.width, 3)
+
+    def unprojected(self, rows: I64, columns: I64, distance: F64) -> F64:
+        """Return the points ``(N, 3)`` in the camera's axes that pixels show at distances ``(N,)``
+        from its centre.
+        """
+        return np.asarray(self.rays()[rows, columns] * distance[:, None], dtype=np.float64)
 
     def above_horizon(self) -> Bool:
         """Return which pixels ``(H, W)`` look up, towards +z of the world."""

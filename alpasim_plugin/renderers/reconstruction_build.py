@@ -78,7 +78,7 @@ def build(
         name: cloud for name, cloud in fitted.actors.items() if len(cloud) >= FEWEST_GAUSSIANS
     }
     sky_views = [
-        SkyView(view.camera, view.sky.astype(np.float32), view.camera_name)
+        SkyView(view.pinhole, view.sky.astype(np.float32), view.camera_name)
         for view in believed
         if view.sky is not None
     ]

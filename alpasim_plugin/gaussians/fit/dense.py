@@ -59,7 +59,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
     flow.setFinestScale(1)
     out = []
     for i, view in enumerate(views):
-        guess = between_points(view.camera, tracks, placed, i)
+        guess = between_points(view.pinhole, tracks, placed, i)
         near = [
             i + gap
             for gap in GAPS
@@ -69,7 +69,7 @@ def depth_maps(views: Sequence[PosedView], tracks: Tracks, placed: Placed) -> li
             out.append(np.zeros(view.rgb.shape[:2], dtype=np.float32))
             continue
         neighbours = [
-            _NeighbourFlow.by_flow(view.camera, views[j].camera, greys[i], greys[j], guess, flow)
+            _NeighbourFlow.by_flow(view.pinhole, views[j].pinhole, greys[i], greys[j], guess, flow)
             for j in near
         ]
         out.append(_depth(view, neighbours, guess))
@@ -212,14 +212,14 @@ def _agreed(views: Sequence[PosedView], maps: Sequence[F32], i: int) -> F32:
     """
     depth = maps[i]
     rows, columns = np.nonzero(depth)
-    camera = views[i].camera
+    camera = views[i].pinhole
     z = depth[rows, columns].astype(np.float64)
     local = camera.unprojected(rows, columns, z)
     confirmed = np.zeros(len(z), dtype=bool)
     covered = np.zeros(len(z), dtype=bool)
     for gap in GAPS:
         if 0 <= i + gap < len(views):
-            other = views[i + gap].camera
+            other = views[i + gap].pinhole
             T = other.T_camera_world @ np.linalg.inv(camera.T_camera_world)
             p = local @ T[:3, :3].T + T[:3, 3]
             ahead = np.maximum(p[:, 2], 1e-3)

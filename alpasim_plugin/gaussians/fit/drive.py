@@ -14,13 +14,20 @@ from alpasim_plugin.core.types import F32, Box
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
 from alpasim_plugin.gaussians.fit.dense import STRIDE, between_points, depth_maps, sky_masks
-from alpasim_plugin.gaussians.fit.lens import balances, gain_near
+from alpasim_plugin.gaussians.fit.lens import (
+    balances,
+    distances_through_lens,
+    gain_near,
+    through_lens,
+    without_distortion,
+)
 from alpasim_plugin.gaussians.fit.loop import fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start, start_from_maps, start_in_boxes
 from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place
 from alpasim_plugin.gaussians.fit.views import PosedView, camera_of
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
@@ -47,7 +54,7 @@ def fit_drive(
     views: Sequence[PosedView],
     points: GaussianCloud | None,
     *,
-    kept: Mapping[str, PinholeCamera] | None = None,
+    kept: Mapping[str, PinholeCamera | LensCamera] | None = None,
     boxes: Mapping[str, Box] | None = None,
     scene_id: str = "drive",
     folder: Path | None = None,
@@ -61,7 +68,8 @@ def fit_drive(
 
     Args:
         views: To fit to, +z of the world up; names sort them along the way, and up to the last
-            ``-`` they name the camera.
+            ``-`` they name the camera. Those through a lens are fitted so, on the CPU alone; depth,
+            sky and exposure are measured in their pinhole images.
         points: Measured or triangulated points; None starts from what the views' own depth gives.
         kept: Names and cameras of the photographs that are held out. Their pixels are not passed;
             their gains are those of their camera's nearest fitted photographs.
@@ -109,7 +117,9 @@ def _boxes_in_view(views: Sequence[PosedView], boxes: Mapping[str, Box]) -> dict
 
 
 def _exposures(
-    views: Sequence[PosedView], model: Reconstruction, kept: Mapping[str, PinholeCamera]
+    views: Sequence[PosedView],
+    model: Reconstruction,
+    kept: Mapping[str, PinholeCamera | LensCamera],
 ) -> dict[str, tuple[float, float, float]]:
     """Return the gains of the fitted photographs, and of those that were kept from the fit the
     gains of their neighbours.
@@ -137,11 +147,33 @@ def prepared_views(
         camera_views = sorted(
             (view for view in views if view.camera_name == camera), key=lambda view: view.name
         )
-        done, guess = _of_one_camera(camera_views)
-        ordered += done
-        guesses += guess
+        images = [without_distortion(view) for view in camera_views]
+        for view, image, guess in zip(camera_views, *_of_one_camera(images), strict=True):
+            ordered.append(_as_taken(view, image))
+            guesses.append(_guess_as_taken(view, image, guess))
     tell("measuring depth, sky and exposure", len(cameras), len(cameras), {})
     return ordered, guesses
+
+
+def _as_taken(view: PosedView, image: PosedView) -> PosedView:
+    """Return a view with what was measured in its image without distortion."""
+    camera = view.camera
+    if not isinstance(camera, LensCamera):
+        return image
+    assert image.depth is not None
+    sky = view.sky
+    if sky is None and image.sky is not None:
+        sky = through_lens(camera, image.pinhole, image.sky.astype(np.float32)) > 0
+    depth = view.depth
+    if depth is None:
+        depth = distances_through_lens(camera, image.pinhole, image.depth)
+    return replace(view, sky=sky, depth=depth, gain=image.gain)
+
+
+def _guess_as_taken(view: PosedView, image: PosedView, guess: F32 | None) -> F32 | None:
+    if guess is None or not isinstance(view.camera, LensCamera):
+        return guess
+    return distances_through_lens(view.camera, image.pinhole, guess)
 
 
 def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F32 | None]]:
@@ -150,7 +182,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         if len({view.rgb.shape for view in views}) == 1
         else Tracks(*(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 2)), 0)
     )
-    placed = place(tracks, [view.camera for view in views])
+    placed = place(tracks, [view.pinhole for view in views])
     maps = depth_maps(views, tracks, placed)
     measured = [
         view if view.depth is not None else replace(view, depth=depth)
@@ -172,7 +204,7 @@ def _of_one_camera(views: Sequence[PosedView]) -> tuple[list[PosedView], list[F3
         depth = view.depth if sky is None else np.where(sky, np.float32(0), view.depth)
         red, green, blue = gain.tolist()
         done.append(replace(view, sky=sky, depth=depth, gain=(red, green, blue)))
-        q = between_points(view.camera, tracks, placed, i)
+        q = between_points(view.pinhole, tracks, placed, i)
         guesses.append(None if q is None else np.asarray(1 / np.maximum(q, 1e-3), dtype=np.float32))
     return done, guesses
 
@@ -223,7 +255,7 @@ def _start(
 
 
 def _gain_near(
-    views: Sequence[PosedView], name: str, camera: PinholeCamera
+    views: Sequence[PosedView], name: str, camera: PinholeCamera | LensCamera
 ) -> tuple[float, float, float]:
     """Return the gain of a photograph that was not fitted."""
     red, green, blue = gain_near(

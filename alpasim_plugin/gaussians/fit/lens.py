@@ -1,5 +1,5 @@
-"""What the camera did to a photograph: its lens (OpenCV's models, and the pinhole image without
-distortion), exposure and balance.
+"""What the camera did to a photograph: its lens (OpenCV's models, the pinhole image without
+distortion, and the way back from it), exposure and balance.
 
 A camera that meters for itself changes its gain by a tenth from one street corner to the next. A
 surface keeps its brightness, so the logarithm of what a photograph shows of a track's point is the
@@ -18,9 +18,11 @@ import scipy
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import intrinsics
-from alpasim_plugin.core.types import F32, F64, I64, U8
+from alpasim_plugin.core.types import F32, F64, I64, U8, CameraSpec, LensModel
+from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.fit.tracks import Tracks
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 
 # Of a fisheye's pinhole image, from its middle to a side: beyond, pixels are only stretched
 FISHEYE_HALF_VIEW_RAD = np.radians(50.0)
@@ -107,6 +109,35 @@ class Lens:
         )
         return cv2.remap(image, x, y, cv2.INTER_LINEAR)
 
+    def camera(self, name: str, T_world_camera: F64) -> LensCamera:
+        """Return the camera of the photograph as it is, with its distortion.
+
+        Raises:
+            InputError: Values that make no lens.
+        """
+        coefficients = tuple(float(value) for value in self.distortion)
+        model = LensModel(self.model, coefficients)
+        spec = CameraSpec(name, self.width, self.height, self.K, np.eye(4), 0, model)
+        return LensCamera.from_pose(spec, T_world_camera)
+
+    @classmethod
+    def of(cls, spec: CameraSpec) -> Lens:
+        """Return the lens of a camera.
+
+        Raises:
+            InputError: An f-theta lens, which is none of OpenCV's.
+        """
+        lens = spec.lens
+        assert lens is not None, "a pinhole has no lens"
+        if lens.kind == "ftheta":
+            raise InputError(
+                f"camera {spec.name!r}: photographs through an f-theta lens",
+                "give an opencv or a fisheye lens that is close to it",
+            )
+        few = np.zeros(max(0, 4 - len(lens.coefficients)))  # OpenCV takes four at least
+        distortion = np.concatenate([np.array(lens.coefficients, dtype=np.float64), few])
+        return cls(spec.width, spec.height, spec.K, distortion, lens.kind)
+
     def resized(self, width: int) -> Lens:
         """Return the lens of the same photograph at another width, pixels."""
         height = round(self.height * width / self.width)
@@ -116,6 +147,48 @@ class Lens:
             height=height,
             K=np.diag([width / self.width, height / self.height, 1.0]) @ self.K,
         )
+
+
+def without_distortion(view: PosedView) -> PosedView:
+    """Return the pinhole image of a view through a lens, which shows a part of it, without depth and sky;
+    a view of a pinhole is returned as it is.
+
+    Raises:
+        InputError: An f-theta lens.
+    """
+    camera = view.camera
+    if isinstance(camera, PinholeCamera):
+        return view
+    lens = Lens.of(camera.spec)
+    pinhole = PinholeCamera(lens.width, lens.height, lens.straight_K(), camera.T_camera_world)
+    rgb = np.ascontiguousarray(lens.straightened(view.rgb))
+    mask = None
+    if view.mask is not None:
+        mask = lens.straightened(np.where(view.mask, np.uint8(255), np.uint8(0))) == 255
+    return replace(view, camera=pinhole, rgb=rgb, mask=mask, depth=None, sky=None)
+
+
+def through_lens(camera: LensCamera, pinhole: PinholeCamera, image: F32) -> F32:
+    """Return what an image ``(H, W)`` of `without_distortion` says of the pixels of the lens's image, the
+    nearest pixel's value as it is; 0 where it does not reach.
+    """
+    ray = camera.rays()
+    is_ahead = (ray[..., 2] > 1e-3) & camera.visible
+    slope = ray[..., :2] / np.where(is_ahead, ray[..., 2], 1.0)[..., None]
+    place = slope * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy] - 0.5
+    place = np.where(is_ahead[..., None], place, -2.0).astype(np.float32)
+    carried = cv2.remap(  # type: ignore[call-overload,unused-ignore]
+        image, place, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+    )
+    return np.asarray(carried, dtype=np.float32)
+
+
+def distances_through_lens(camera: LensCamera, pinhole: PinholeCamera, depth: F32) -> F32:
+    """Return distances from the camera's centre ``(H, W)``, metres, of the pixels of the lens's image, from
+    depths of a pinhole's; 0 where they are unknown.
+    """
+    ahead = np.maximum(camera.rays()[..., 2], 1e-3)
+    return np.asarray(through_lens(camera, pinhole, depth) / ahead, dtype=np.float32)
 
 
 PATCH_PX = 7

@@ -39,6 +39,7 @@ from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction, sky_of
 from alpasim_plugin.gaussians.fit.start import Start
 from alpasim_plugin.gaussians.fit.views import PosedView, halved
+from alpasim_plugin.gaussians.lens_camera import LensCamera, lens_key
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_triton import compositor_of
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
@@ -63,7 +64,8 @@ def fit(
     """Fit a background, and the actors that ``start`` holds, to posed views.
 
     Args:
-        views: To train on, all of them; see `held_out`.
+        views: To train on, all of them; see `held_out`. Those through a lens are fitted on the CPU
+            alone, in the lens's own image.
         start: Gaussians to begin with: see `start_from_depth` and `cloud_from_points`. A cloud
             alone is a background without actors.
         recipe: Amounts, rates and schedule.
@@ -121,7 +123,7 @@ class _Target:
     """A view as the loop needs it; the camera is moved to the fit's frame."""
 
     name: str
-    camera: PinholeCamera
+    camera: PinholeCamera | LensCamera
     rgb: Tensor  # (H, W, 3) 0..1
     behind: Tensor | None  # (H, W, 3) sky
     sky: Tensor | None  # (H, W) 0 or 1
@@ -349,10 +351,13 @@ def _digest(views: Sequence[PosedView], start: Start) -> str:
         digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
 
     for view in views:
+        camera = view.camera
+        if isinstance(camera, LensCamera):
+            digest.update(repr(lens_key(camera.spec)).encode())
         for array in (
             view.rgb,
-            view.camera.K,
-            view.camera.T_camera_world,
+            camera.spec.K if isinstance(camera, LensCamera) else camera.K,
+            camera.T_camera_world,
             view.sky,
             view.mask,
             view.depth,

@@ -1,5 +1,5 @@
-"""Read and write photographs with poses: a folder of images and a ``transforms.json``. Every reader
-of photographs undistorts here.
+"""Read and write photographs with poses: a folder of images and a ``transforms.json``. A photograph is a
+view through its lens, or freed of its distortion.
 
 The file's keys are those of Instant-NGP and nerfstudio, which many tools write (COLMAP's poses
 through their converters, for example):
@@ -15,7 +15,7 @@ through their converters, for example):
 nerfstudio mean). Sizes, intrinsics and OpenCV's distortion (k1, k2, p1, p2, k3; with
 ``"camera_model": "OPENCV_FISHEYE"`` k1 to k4) may stand in a frame instead; ``camera_angle_x`` and
 ``camera_angle_y``, radians, or ``x_fov`` and ``y_fov``, degrees, may stand for the focal lengths.
-Images are freed of their distortion as they are read. Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
+Optional: ``t_us`` places the actors of a scenario; ``camera`` names the camera; ``ply_file_path``
 names points to start from: a binary PLY with x, y, z and, if coloured, red, green, blue (0..255).
 """
 
@@ -28,6 +28,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import resized as resized_camera
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import read_bytes, read_json_object
 from alpasim_plugin.core.files.fields import Fields, field_name
@@ -42,6 +43,7 @@ from alpasim_plugin.gaussians.files.ply import read_ply_element, read_ply_header
 from alpasim_plugin.gaussians.fit.lens import Lens
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
 from alpasim_plugin.gaussians.fit.views import PosedView
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 
 FILE = "transforms.json"
 # The file's camera axes to ours
@@ -140,13 +142,32 @@ class PosedPhotograph:
         Raises:
             InputError: See `encoded`.
         """
+        return np.ascontiguousarray(self.lens.straightened(self._as_taken()))
+
+    def _as_taken(self) -> U8:
         bgr = decode_image(self.encoded(), f"{self.location}, {self.file}", WHOLE, AS_STORED)
-        return np.ascontiguousarray(
-            self.lens.straightened(np.asarray(bgr, dtype=np.uint8)[..., ::-1])
+        return np.asarray(bgr, dtype=np.uint8)[..., ::-1]
+
+    def whole_view(self) -> PosedView:
+        """Return it as a view at full size through its lens: all of the photograph, of which those pixels
+        count that the lens describes.
+
+        Raises:
+            InputError: See `encoded`; or its numbers make no lens.
+        """
+        if not self.lens.bends:
+            return self.view()
+        camera = self.lens.camera(self.location, self.T_world_camera)
+        return PosedView(
+            camera,
+            np.ascontiguousarray(self._as_taken()),
+            self.file.stem,
+            mask=None if camera.visible.all() else camera.visible,
+            t_us=int(self.t_us or 0),
         )
 
     def view(self) -> PosedView:
-        """Return it as a view at full size."""
+        """Return it as a view at full size, without distortion."""
         lens = self.lens
         return PosedView(
             PinholeCamera.from_pose(
@@ -260,18 +281,25 @@ def read_points(path: Path) -> GaussianCloud:
 
 def resized(view: PosedView, width: int) -> PosedView:
     """Return a view with another number of pixels, its field of view unchanged; without sky, mask
-    and depth, which are of single pixels.
+    and depth, which are of single pixels, but for the mask of what a lens describes.
     """
     camera = view.camera
     height = round(camera.height * width / camera.width)
-    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    small: PinholeCamera | LensCamera
+    mask = None
+    if isinstance(camera, LensCamera):
+        small = replace(camera, spec=resized_camera(camera.spec, width, height))
+        mask = None if small.visible.all() else small.visible
+    else:
+        K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+        small = PinholeCamera(width, height, K, camera.T_camera_world)
     rgb = cv2.resize(view.rgb, (width, height), interpolation=cv2.INTER_AREA)
     return replace(
         view,
-        camera=PinholeCamera(width, height, K, camera.T_camera_world),
+        camera=small,
         rgb=np.asarray(rgb, dtype=np.uint8),
         sky=None,
-        mask=None,
+        mask=mask,
         depth=None,
     )
 

@@ -234,7 +234,7 @@ def corrected(views: Sequence[PosedView]) -> Adjusted:
     """Return cameras of views, in the order of the way and of one size, whose poses agree with what
     the views show; the same cameras where there are too few tracks to say.
     """
-    cameras = [view.camera for view in views]
+    cameras = [view.pinhole for view in views]
     tracks = follow(views)
     kept = tracks.only(_good(tracks, place(tracks, cameras), 3 * LARGEST_ERROR_PX))
     if kept.count < 10:

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import resized as resized_camera
 from alpasim_plugin.core.geometry import interpolate, shifted
 from alpasim_plugin.core.types import F32, F64, U8, Bool, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.scene.log_views import log_actors
 from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
 
@@ -20,20 +22,20 @@ class PosedView:
     """One image of which it is known from where it was taken.
 
     Attributes:
-        camera: From where.
+        camera: From where, through a lens where the image has its distortion.
         rgb: ``(H, W, 3)`` uint8 sRGB.
         name: For messages and file names; up to the last ``-`` it names the camera.
         sky: ``(H, W)`` bool, where the image shows sky; None where that is unknown.
         mask: ``(H, W)`` bool, which pixels count (not the bonnet, say); None counts all.
-        depth: ``(H, W)`` float32, metres along the optical axis, 0 where unknown; a start is drawn
-            from it, and a fit may be held to it.
+        depth: ``(H, W)`` float32, metres along the optical axis, of a lens from the camera's centre,
+            0 where unknown; a start is drawn from it, and a fit may be held to it.
         actors: Actor id to ``T_world_box (4, 4)`` of the actors present.
         gain: Of red, green and blue over the model's colours: the photograph's exposure and white
             balance.
         t_us: When it was taken, where that is known.
     """
 
-    camera: PinholeCamera
+    camera: PinholeCamera | LensCamera
     rgb: U8
     name: str = "view"
     sky: Bool | None = None
@@ -47,6 +49,12 @@ class PosedView:
     def camera_name(self) -> str:
         """Return the name of the camera that took it."""
         return camera_of(self.name)
+
+    @property
+    def pinhole(self) -> PinholeCamera:
+        """Return the camera of a view without distortion."""
+        assert isinstance(self.camera, PinholeCamera), "a view through a lens"
+        return self.camera
 
 
 def camera_of(view: str) -> str:
@@ -127,13 +135,9 @@ def halved(view: PosedView) -> PosedView:
     A pixel shows the mean of an area of two by two pixels about its middle; it is sky, or counts,
     where all that the area touches do.
     """
-    camera = view.camera
-    h = camera.height // 2
-    w = camera.width // 2
+    h = view.camera.height // 2
+    w = view.camera.width // 2
     every_second = slice(0, 2 * h, 2), slice(0, 2 * w, 2)
-    K = camera.K.copy()
-    K[:2] /= 2
-    K[:2, 2] += 0.25  # the first pixel's middle, at 0.5 in both images
     # Half of a pixel's neighbours lies in the area.
     rgb = cv2.sepFilter2D(view.rgb, -1, AREA, AREA, borderType=cv2.BORDER_REPLICATE)
 
@@ -145,9 +149,24 @@ def halved(view: PosedView) -> PosedView:
 
     return replace(
         view,
-        camera=PinholeCamera(w, h, K, camera.T_camera_world),
+        camera=_half_camera(view.camera),
         rgb=np.ascontiguousarray(rgb[every_second]),
         sky=touched(view.sky),
         mask=touched(view.mask),
         depth=None if view.depth is None else np.ascontiguousarray(view.depth[every_second]),
     )
+
+
+def _half_camera(camera: PinholeCamera | LensCamera) -> PinholeCamera | LensCamera:
+    """Return the camera of `halved`: the first pixel's middle is at 0.5 in both images."""
+    h = camera.height // 2
+    w = camera.width // 2
+    if isinstance(camera, LensCamera):
+        even = replace(camera.spec, width=2 * w, height=2 * h)
+        small = resized_camera(even, w, h)
+        K = small.K + np.array([[0, 0, 0.25], [0, 0, 0.25], [0, 0, 0]])
+        return replace(camera, spec=replace(small, K=K))
+    K = camera.K.copy()
+    K[:2] /= 2
+    K[:2, 2] += 0.25
+    return PinholeCamera(w, h, K, camera.T_camera_world)

@@ -132,7 +132,7 @@ def make_photograph_pairs(
 def _info(
     photographs: Photographs, name: str, recipe: PhotographRecipe, phase: int
 ) -> dict[str, Any]:
-    camera = photographs.views[0].camera
+    camera = photographs.views[0].pinhole
     lens = {
         "width": camera.width,
         "height": camera.height,

@@ -91,7 +91,7 @@ def _cut(view: PosedView, width: int, location: str) -> PosedView:
             f"{location}: {height} pixels high at {width} across", "choose a larger width"
         )
     top = (height - kept) // 2
-    K = small.camera.K.copy()
+    K = small.pinhole.K.copy()
     K[1, 2] -= top
     camera = PinholeCamera(width, kept, K, small.camera.T_camera_world)
     return PosedView(camera, np.ascontiguousarray(small.rgb[top : top + kept]), view.name)
@@ -123,7 +123,7 @@ def triangulated(
         pair_matches = [m for m in matches if (m.first, m.second) == (i, j)]
         a = np.array([m.at_first for m in pair_matches])
         b = np.array([m.at_second for m in pair_matches])
-        place, good = _triangulate(views[i].camera, views[j].camera, a, b)
+        place, good = _triangulate(views[i].pinhole, views[j].pinhole, a, b)
         pixels = a[good].astype(np.int64)
         parts.append((place[good], views[i].rgb[pixels[:, 1], pixels[:, 0]] / 255.0))
     points = np.concatenate([np.zeros((0, 3)), *(place for place, _ in parts)])
