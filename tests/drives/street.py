@@ -161,18 +161,23 @@ def write_transforms(
     axes="opencv",
     say_axes=True,
     street=None,
+    bend=None,
     **keys,
 ):
-    """Write the street as ``transforms.json``; keys of the document are added."""
+    """Write the street as ``transforms.json``; keys of the document are added. ``bend`` is k1, k2, p1,
+    p2 of the lens.
+    """
     chosen = street or Street()
     (folder / "images").mkdir(parents=True)
     turn = np.eye(4) if axes == "opencv" else np.diag([1.0, -1.0, -1.0, 1.0])
     frames = []
     for i, x in enumerate(stations()):
         name = f"images/{i:03d}.png"
-        cv2.imwrite(str(folder / name), chosen.photograph(chosen.pose(x)))
+        coefficients = None if bend is None else np.array(bend)
+        cv2.imwrite(str(folder / name), chosen.photograph(chosen.pose(x), coefficients))
         frames.append({"file_path": name, "transform_matrix": (chosen.pose(x) @ turn).tolist()})
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": K[0, 2], "cy": K[1, 2]}
+    lens |= dict(zip(("k1", "k2", "p1", "p2"), bend or (), strict=False))
     document = {**lens, **({"axes": axes} if say_axes else {}), "frames": frames, **keys}
     (folder / "transforms.json").write_text(json.dumps(document))
     return folder

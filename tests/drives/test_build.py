@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,9 +18,20 @@ from alpasim_plugin.drives.held_out import measured
 from alpasim_plugin.drives.opening import read_source
 from alpasim_plugin.drives.placing import place
 from alpasim_plugin.drives.source import Points
+from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.world.ground import height_at
 from scenarios.load import load_scenario
-from tests.drives.street import COUNT, STEP_M, Street, edited, write_kitti, write_transforms
+from tests.drives.conftest import at_once
+from tests.drives.street import (
+    COUNT,
+    HEIGHT,
+    STEP_M,
+    WIDTH,
+    Street,
+    edited,
+    write_kitti,
+    write_transforms,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -117,8 +129,17 @@ def test_where_no_road_is_below_the_cameras_every_fifth_photograph_is_held_out(w
     assert "photographs taken along a road" in str(placed.notes)
 
 
-def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
-    folder = write_transforms(tmp_path / "walk", axes="opengl", say_axes=False, unit="m")
+def test_the_command_tells_what_it_found_and_fits_whole_photographs(tmp_path, monkeypatch, capsys):
+    """Of a lens that bends lines: the fit and the comparison see its image, borders and all."""
+    fitted = []
+
+    def keep_views(views, start, **rest):
+        fitted.extend(views)
+        return at_once(views, start, **rest)
+
+    monkeypatch.setattr(build, "fit_drive", keep_views)
+    bend = (-0.12, 0.01, 1e-3, -1e-3)
+    folder = write_transforms(tmp_path / "walk", "opengl", say_axes=False, bend=bend, unit="m")
     command = [
         "import",
         "drive",
@@ -137,6 +158,14 @@ def test_the_command_tells_what_it_found(tmp_path, quick_fit, capsys):
     assert any("opengl" in note for note in told["notes"])
     assert told["held-out"]["psnr_db"] > 5
     assert "## What is missing or assumed" in (tmp_path / "out/quality.md").read_text()
+    assert all(isinstance(view.camera, LensCamera) for view in fitted)
+    assert fitted[0].camera.spec.lens.coefficients == (*bend, 0.0)
+    as_taken = cv2.imread(str(folder / "images/000.png"))[..., ::-1]
+    np.testing.assert_array_equal(fitted[0].rgb, as_taken)
+    compared = cv2.imread(str(next((tmp_path / "out/images").glob("held-out-*.jpg"))))
+    assert compared.shape == (2 * HEIGHT, WIDTH, 3)
+    straight = cv2.imread(str(tmp_path / "out/photographs/front/000000.png"))[..., ::-1]
+    assert np.abs(straight.astype(float) - as_taken).mean() > 5.0
 
 
 XODR = """<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="60" id="1" junction="-1"><planView>

@@ -157,7 +157,7 @@ def test_the_gradient_on_the_image_moves_means_across_the_lines_of_sight(name, f
         by_step = (turned - rays) / moved * [[9.0], [11.0], [14.0]] @ cam.T_camera_world[:3, :3]
         expected = (gradients["means"][out.index] * by_step[out.index]).sum(axis=1)
         largest = np.abs(out.uv.grad.numpy()).max()
-        assert np.allclose(out.uv.grad[:, axis], expected, atol=0.02 * largest)
+        assert np.allclose(out.uv.grad[:, axis].double(), expected, atol=0.02 * largest)
     assert largest > 1e-2
 
 

@@ -109,7 +109,7 @@ def logged_views(
 
 
 def seen_from(
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     scene: SceneGraph,
     actors: Mapping[str, F64],
     name: str,

@@ -148,8 +148,8 @@ def _projected(splats: Splats, camera: LensCamera, drawn: DrawnTiles) -> tuple[_
     p = T[:3, :3] @ (splats.means.double() - centre).T
     V = torch.einsum("ij,jkn->ikn", T[:3, :3], _factors(splats))
     place = lens_place(drawn.lens, p)
-    uv = place.uv.detach().T.contiguous().requires_grad_(p.requires_grad)
-    moved = uv.T - place.uv.detach()  # zero, for its gradient
+    uv = place.uv.detach().T.float().contiguous().requires_grad_(p.requires_grad)
+    moved = (uv - uv.detach()).double().T  # zero, for its gradient
     steps = _pixel_steps(place)
     is_ray = torch.from_numpy(_is_along_ray(drawn))
     rays = torch.nonzero(is_ray)[:, 0]
