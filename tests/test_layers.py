@@ -27,7 +27,7 @@ STAGES = {
     A + "gaussians.files": (A + "gaussians",),
     A + "gaussians.raster": (A + "gaussians", A + "cameras"),
     A + "gaussians.scene": CLOUDS,
-    A + "gaussians.fit": (*CLOUDS, A + "gaussians.scene"),
+    A + "gaussians.fit": (A + "cameras", *CLOUDS, A + "gaussians.scene"),
     A + "streets": (A + "world", *CLOUDS, A + "gaussians.scene"),
     "scenarios": (A + "world", A + "cameras"),
     A + "renderers": (A + "world", A + "cameras", *GAUSSIANS, A + "streets"),

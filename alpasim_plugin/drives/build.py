@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.cameras.lens import projected
-from alpasim_plugin.core.devices import require_device
+from alpasim_plugin.core.devices import implementation, require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import content_of, read_json, read_json_object
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
@@ -194,7 +194,7 @@ def _built(
     )
     drive = replace(drive, notes=(*drive.notes, *notes))
     photographs = placed_photographs(drive, placed, stride)
-    through_lens = device.partition(":")[0] == "cpu"
+    through_lens = implementation(device, True, False)
     if not through_lens and any(photograph.source.lens.bends for photograph in photographs):
         drive = replace(drive, notes=(*drive.notes, STRAIGHT_ON_GPU))
     begin(work, key)

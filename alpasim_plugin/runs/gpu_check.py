@@ -30,13 +30,14 @@ from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_triton import (
     DrawnCloud,
     TileCompositor,
     UploadedClouds,
     compositor_of,
 )
+from alpasim_plugin.gaussians.raster.splats import Splats
 from alpasim_plugin.runs.cameras import recorded_requests
 from alpasim_plugin.runs.gpu_work import COUNTED, H100, PEAKS, transparent_splats
 from alpasim_plugin.runs.renderer import make_renderer

@@ -10,14 +10,12 @@ import torch
 from alpasim_plugin.core.seeding import stream
 from alpasim_plugin.gaussians import GaussianCloud, PinholeCamera
 from alpasim_plugin.gaussians.cloud import logit, sigmoid
-from alpasim_plugin.gaussians.raster.rasterize_gradient import (
-    Splats,
-    rasterize_gradient,
-)
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
+from alpasim_plugin.gaussians.raster.splats import Splats
 
 
 def cloud_of(splats):

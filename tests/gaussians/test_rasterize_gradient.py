@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from alpasim_plugin.gaussians import GaussianCloud
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_reference import (
     composite_reference,
     project_gaussians,
 )
+from alpasim_plugin.gaussians.raster.splats import Splats
 from tests.examples import first_of
 from tests.gaussians.driving_scene import driving_camera, driving_like_scene
 from tests.gaussians.gaussian_scenes import camera, random_cloud

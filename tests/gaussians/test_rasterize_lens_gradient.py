@@ -10,9 +10,10 @@ from alpasim_plugin.core.types import CameraSpec, LensModel
 from alpasim_plugin.gaussians import GaussianCloud, rasterize
 from alpasim_plugin.gaussians.cloud import sigmoid
 from alpasim_plugin.gaussians.lens_camera import LensCamera
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats, rasterize_gradient
+from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_lens import drawn_splats
 from alpasim_plugin.gaussians.raster.rasterize_lens_gradient import _is_along_ray, _prepared
+from alpasim_plugin.gaussians.raster.splats import Splats
 from tests.gaussians.gradient_scenes import (
     assert_close,
     central_differences,
@@ -21,8 +22,8 @@ from tests.gaussians.gradient_scenes import (
     weights_of,
 )
 from tests.gaussians.lens_reference import LensReference
-from tests.gaussians.test_rasterize_lens import WORLD, around, cloud_of
-from tests.gaussians.test_rasterize_lens import camera as rolling_camera
+from tests.gaussians.lens_scenes import WORLD, around, cloud_of
+from tests.gaussians.lens_scenes import camera as rolling_camera
 
 WIDTH = 24
 HEIGHT = 18

@@ -23,7 +23,7 @@ from alpasim_plugin.core.types import F64
 from alpasim_plugin.gaussians.cloud import GaussianCloud, logit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.start import Start
-from alpasim_plugin.gaussians.raster.rasterize_gradient import Splats
+from alpasim_plugin.gaussians.raster.splats import Splats
 from alpasim_plugin.gaussians.sh import SH_SIZES, sh_rotation
 
 NAMES = ("means", "log_scales", "quaternions", "logit_opacities", "sh_dc", "sh_rest")

@@ -64,8 +64,8 @@ def rasterize_lens(
         lens sees nothing it is black and opaque.
     """
     behind = background_image(background, camera)
-    drawn = drawn_splats(nodes, camera, near_m=near_m, threads=threads, starts=starts)
-    return RasterOutput(*composite_lens(drawn, camera, None, behind, threads))
+    tile_splats = drawn_splats(nodes, camera, near_m=near_m, threads=threads, starts=starts)
+    return RasterOutput(*composite_lens(tile_splats, camera, None, behind, threads))
 
 
 class DrawnSplats(NamedTuple):
@@ -135,10 +135,10 @@ def drawn_splats(
 
 
 def composite_lens(
-    drawn: DrawnTiles, camera: LensCamera, kept: F32 | None, behind: F32 | None, threads: int
+    tile_splats: DrawnTiles, camera: LensCamera, kept: F32 | None, behind: F32 | None, threads: int
 ) -> tuple[F32, F32, F32]:
     """Return colour ``(H, W, 3)``, alpha and depth ``(H, W)``: see `composite_lens_tiles`."""
-    tiles = drawn.tiles
+    tiles = tile_splats.tiles
     table = tile_rays(camera)
     shape = (camera.height, camera.width)
     colour = np.empty((*shape, 3), dtype=np.float32)
@@ -151,12 +151,12 @@ def composite_lens(
         tiles.columns,
         tiles.starts,
         tiles.lists,
-        drawn.splats.records,
+        tile_splats.splats.records,
         table.rays,
         table.alive,
         table.blocks,
-        drawn.lens,
-        drawn.motion,
+        tile_splats.lens,
+        tile_splats.motion,
         kept,
         behind,
         colour,

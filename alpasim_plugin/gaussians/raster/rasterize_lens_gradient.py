@@ -33,16 +33,16 @@ from alpasim_plugin.gaussians.raster.lens_rays import tile_rays
 from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2, ROW_A, SHORT
 from alpasim_plugin.gaussians.raster.prepared import PreparedCloud, packed
 from alpasim_plugin.gaussians.raster.raster_kernels import KEPT
-from alpasim_plugin.gaussians.raster.rasterize_gradient import (
-    GradientOutput,
-    Splats,
-    colours_of,
-    screen_covariance,
-)
 from alpasim_plugin.gaussians.raster.rasterize_lens import (
     DrawnTiles,
     composite_lens,
     drawn_splats,
+)
+from alpasim_plugin.gaussians.raster.splats import (
+    GradientOutput,
+    Splats,
+    colours_of,
+    screen_covariance,
 )
 from alpasim_plugin.gaussians.raster.stages import run_on_threads, thread_count
 
@@ -70,18 +70,20 @@ def rasterize_lens_gradient(
         )
     workers = thread_count(threads)
     with torch.no_grad():
-        drawn = drawn_splats([(_prepared(splats), None)], camera, near_m=near_m, threads=workers)
-    view = _LensView(drawn, camera, workers)
-    index = torch.from_numpy(drawn.splats.ids)
+        tile_splats = drawn_splats(
+            [(_prepared(splats), None)], camera, near_m=near_m, threads=workers
+        )
+    view = _LensView(tile_splats, camera, workers)
+    index = torch.from_numpy(tile_splats.splats.ids)
     chosen = Splats(*(tensor.index_select(0, index) for tensor in splats))
-    projected, uv = _projected(chosen, camera, drawn)
+    projected, uv = _projected(chosen, camera, tile_splats)
     colour_sum, alpha, depth_sum = _CompositeLens.apply(*projected, view)  # type: ignore[no-untyped-call]
     rgb = colour_sum
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.float()
     depth = torch.where(alpha > 0, depth_sum / torch.where(alpha > 0, alpha, 1.0), 0.0)
     on_screen = torch.ones_like(index, dtype=torch.bool)
-    pairs = torch.tensor(len(drawn.tiles.lists))
+    pairs = torch.tensor(len(tile_splats.tiles.lists))
     return GradientOutput(rgb, alpha, depth, index, uv, on_screen, pairs)
 
 
@@ -139,7 +141,9 @@ class _Projected(NamedTuple):
     distance: Tensor
 
 
-def _projected(splats: Splats, camera: LensCamera, drawn: DrawnTiles) -> tuple[_Projected, Tensor]:
+def _projected(
+    splats: Splats, camera: LensCamera, tile_splats: DrawnTiles
+) -> tuple[_Projected, Tensor]:
     """Return the projection of drawn splats with its graph, and the places of their means in the image
     ``(M, 2)``, whose gradient is that of moving the splats across the lines of sight.
     """
@@ -147,11 +151,11 @@ def _projected(splats: Splats, camera: LensCamera, drawn: DrawnTiles) -> tuple[_
     centre = torch.from_numpy(camera.centre_world)
     p = T[:3, :3] @ (splats.means.double() - centre).T
     V = torch.einsum("ij,jkn->ikn", T[:3, :3], _factors(splats))
-    place = lens_place(drawn.lens, p)
+    place = lens_place(tile_splats.lens, p)
     uv = place.uv.detach().T.float().contiguous().requires_grad_(p.requires_grad)
     moved = (uv - uv.detach()).double().T  # zero, for its gradient
     steps = _pixel_steps(place)
-    is_ray = torch.from_numpy(_is_along_ray(drawn))
+    is_ray = torch.from_numpy(_is_along_ray(tile_splats))
     rays = torch.nonzero(is_ray)[:, 0]
     ellipses = torch.nonzero(~is_ray)[:, 0]
 
@@ -173,10 +177,10 @@ def _projected(splats: Splats, camera: LensCamera, drawn: DrawnTiles) -> tuple[_
     return projected, uv
 
 
-def _is_along_ray(drawn: DrawnTiles) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _is_along_ray(tile_splats: DrawnTiles) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return which drawn splats ``(M,)`` are evaluated along the rays of pixels."""
-    count = len(drawn.splats.ids)
-    return drawn.splats.records[: count * SHORT].reshape(count, SHORT)[:, INVERSE_O2] >= 0
+    count = len(tile_splats.splats.ids)
+    return tile_splats.splats.records[: count * SHORT].reshape(count, SHORT)[:, INVERSE_O2] >= 0
 
 
 def _pixel_steps(place: LensPlace) -> Tensor:
@@ -200,19 +204,19 @@ Images = tuple[
 class _LensView:
     """One image through a lens, and what takes its gradient back to the splats."""
 
-    def __init__(self, drawn: DrawnTiles, camera: LensCamera, threads: int) -> None:
-        self.drawn = drawn
+    def __init__(self, tile_splats: DrawnTiles, camera: LensCamera, threads: int) -> None:
+        self.tile_splats = tile_splats
         self.camera = camera
         self.threads = threads
-        tiles = len(drawn.tiles.starts) - 1
+        tiles = len(tile_splats.tiles.starts) - 1
         self.kept: F32 = np.empty(tiles * 16 * KEPT, dtype=np.float32)
-        colour, alpha, depth = composite_lens(drawn, camera, self.kept, None, threads)
+        colour, alpha, depth = composite_lens(tile_splats, camera, self.kept, None, threads)
         self.images = torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth)
 
     def sums(self, *gradients: Tensor) -> Tensor:
         """Return what each splat receives ``(LENS_PAIR, M)`` float64 of the gradients of the images."""
-        drawn = self.drawn
-        tiles = drawn.tiles
+        tile_splats = self.tile_splats
+        tiles = tile_splats.tiles
         table = tile_rays(self.camera)
         pairs = np.zeros(len(tiles.lists) * LENS_PAIR, dtype=np.float32)
         run_on_threads(
@@ -222,14 +226,14 @@ class _LensView:
             tiles.columns,
             tiles.starts,
             tiles.lists,
-            drawn.splats.records,
+            tile_splats.splats.records,
             table.rays,
             table.blocks,
             self.kept,
             *(gradient.to(torch.float32).contiguous().numpy() for gradient in gradients),
             pairs,
         )
-        rows: F64 = np.zeros((len(drawn.splats.ids), LENS_PAIR))
+        rows: F64 = np.zeros((len(tile_splats.splats.ids), LENS_PAIR))
         add_pairs(tiles.lists, pairs, rows)
         return torch.from_numpy(rows).T.contiguous()
 
@@ -255,9 +259,9 @@ class _CompositeLens(torch.autograd.Function):
         projected = _Projected(*ctx.saved_tensors)
         view: _LensView = ctx.view
         sums = view.sums(*gradients)
-        is_ray = torch.from_numpy(_is_along_ray(view.drawn))
+        is_ray = torch.from_numpy(_is_along_ray(view.tile_splats))
         first, products = _moments(sums)
-        of_rays = _to_rays(projected, view.drawn, first[:, is_ray], products[..., is_ray])
+        of_rays = _to_rays(projected, view.tile_splats, first[:, is_ray], products[..., is_ray])
         of_ellipses = _to_ellipses(projected, first[:2, ~is_ray], products[:2, :2][..., ~is_ray])
         by_colour = sums[PAIR_COLOUR : PAIR_COLOUR + 3].T
         by_colour = torch.where(projected.colour > 0, by_colour, 0.0)
@@ -280,10 +284,10 @@ def _moments(sums: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _to_rays(
-    projected: _Projected, drawn: DrawnTiles, first: Tensor, products: Tensor
+    projected: _Projected, tile_splats: DrawnTiles, first: Tensor, products: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the gradients of p, V and E of splats along rays."""
-    W = _whitening(projected, _first_rows(drawn))
+    W = _whitening(projected, _first_rows(tile_splats))
     V = projected.V
     E = projected.E
     by_p = torch.einsum("ijn,in->jn", W, first)
@@ -313,11 +317,13 @@ def _to_ellipses(
     return by_uv, w11 * a, w12 * a + w22 * b
 
 
-def _first_rows(drawn: DrawnTiles) -> Tensor:
+def _first_rows(tile_splats: DrawnTiles) -> Tensor:
     """Return the rows A of the records along rays ``(3, L)``."""
-    count = len(drawn.splats.ids)
-    records = drawn.splats.records[: count * SHORT].reshape(count, SHORT)
-    return torch.from_numpy(records[_is_along_ray(drawn), ROW_A : ROW_A + 3].T.astype(np.float64))
+    count = len(tile_splats.splats.ids)
+    records = tile_splats.splats.records[: count * SHORT].reshape(count, SHORT)
+    return torch.from_numpy(
+        records[_is_along_ray(tile_splats), ROW_A : ROW_A + 3].T.astype(np.float64)
+    )
 
 
 def _whitening(projected: _Projected, first_rows: Tensor) -> Tensor:
