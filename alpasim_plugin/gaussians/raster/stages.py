@@ -1,14 +1,19 @@
 """Stages that the CPU rasterisers share: poses of nodes, order of depth, lists by tile, threads.
 
 Kernels release the interpreter lock and share work through an atomic counter, so the same compiled
-code serves any number of threads, nothing is lost by a fork, and one thread costs nothing extra.
+code serves any number of threads, and one thread costs nothing extra. Threads are kept from call to
+call; a forked process starts its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -177,11 +182,15 @@ def thread_count(threads: int | None) -> int:
 def map_on_threads(threads: int, function: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     """Return what a function makes of each item, in their order; a thread that is free takes the
     next.
+
+    An exception in any of them is raised here, after all have ended.
     """
     if min(threads, len(items)) <= 1:
         return [function(item) for item in items]
-    with ThreadPoolExecutor(min(threads, len(items))) as pool:
-        return list(pool.map(function, items))
+    with _pool(min(threads, len(items))) as pool:
+        results = [pool.submit(function, item) for item in items]
+        wait(results)
+    return [result.result() for result in results]
 
 
 def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> None:
@@ -193,8 +202,35 @@ def run_on_threads(threads: int, function: Callable[..., None], *args: Any) -> N
     if threads == 1:
         function(*args)
         return
-    with ThreadPoolExecutor(threads - 1) as pool:
+    with _pool(threads - 1) as pool:
         others = [pool.submit(function, *args) for _ in range(threads - 1)]
-        function(*args)
+        try:
+            function(*args)
+        finally:
+            wait(others)
     for other in others:
         other.result()
+
+
+@contextmanager
+def _pool(threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Yield a pool of threads.
+
+    That of the main thread is kept, because starting threads takes as long as their work in a small
+    image. Another thread may be one of a kept pool, and would wait for itself: it gets a pool of its
+    own, for the time of the block.
+    """
+    if threading.current_thread() is threading.main_thread():
+        yield _kept_pool(threads)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool
+
+
+@lru_cache(maxsize=8)
+def _kept_pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="stages")
+
+
+# A forked process has the pools of its parent, but not their threads.
+os.register_at_fork(after_in_child=_kept_pool.cache_clear)
