@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from alpasim_plugin.cameras.shutter import Along, Band, bands, largest_motion_px
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import unit
+from alpasim_plugin.core.geometry import intrinsics, unit
 from alpasim_plugin.core.types import (
     F32,
     F64,
@@ -75,7 +75,6 @@ class Lens:
         T_lens_pinhole: ``(4, 4)`` where the pinhole looks.
         side: Its name among those that cover the lens; empty where it is the only one.
         first_column: The column of the lens at which its part of the image begins.
-        camera: The camera with the lens; None: the lens is that pinhole.
     """
 
     width: int
@@ -88,7 +87,6 @@ class Lens:
     T_lens_pinhole: F64 = field(default_factory=lambda: np.eye(4))
     side: str = ""
     first_column: int = 0
-    camera: CameraSpec | None = None
 
     def spec(self, name: str, T_rig_camera: F64, shutter_us: int = 0) -> CameraSpec:
         """Return the covering pinhole of a lens at a mounting, as a camera."""
@@ -109,39 +107,6 @@ class Lens:
         if place is None:
             return covering
         return cv2.remap(covering, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def depth(self, distance: F32) -> F32:
-        """Return the depth ``(h, w)`` along the pinhole's axis of what the lens's image shows at
-        distances ``(height, width)`` from the camera; 0 where it shows nothing.
-        """
-        if self.resample is None:
-            return distance
-        place, along = self._lens_place
-        along_rays = cv2.remap(
-            distance, place, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
-        )
-        return np.asarray(along_rays * along, dtype=np.float32)
-
-    def seen_in(self, image: U8) -> U8:
-        """Return the pinhole's image ``(h, w, 3)`` of the lens's; black where that shows nothing."""
-        if self.resample is None:
-            return image
-        place, along = self._lens_place
-        looked_up = cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(looked_up * (along > 0)[..., None], dtype=np.uint8)
-
-    @cached_property
-    def _lens_place(self) -> tuple[F32, F32]:
-        """Where the lens shows each pixel ``(h, w, 2)``, and the share of a distance that lies along
-        the axis there ``(h, w)``, 0 where the lens shows nothing.
-        """
-        assert self.camera is not None, "a pinhole that covers a lens"
-        place, is_visible = place_in_lens(self.camera, self)
-        width, height = self.cover
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        plane = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(self.K).T
-        along = is_visible / np.linalg.norm(plane, axis=-1)
-        return place, along.astype(np.float32)
 
 
 def lens_camera(pinhole: str) -> str:
@@ -197,7 +162,7 @@ def sides_of(camera: CameraSpec) -> tuple[Lens, ...]:
     if camera.lens is None:
         return (lens_of(camera),)
     rays = rays_of(camera)
-    _require_cover(camera, rays)
+    require_sight(camera, rays)
     if rays.widest_rad <= WIDEST_OF_ONE_RAD:
         return (_covered(camera, rays, rays.visible, ""),)
     turns = _panels(rays)
@@ -333,7 +298,7 @@ def blind_of(sides: Sequence[Lens]) -> Bool | None:
 
 
 def blackened(image: U8, blind: Bool | None) -> U8:
-    """Return an image ``(height, width, 3)`` that is black where its lens sees nothing."""
+    """Return an image ``(height, width, C)`` that is 0 where its lens sees nothing."""
     return image if blind is None else np.where(blind[..., None], np.uint8(0), image)
 
 
@@ -584,10 +549,15 @@ def check_lens(camera: CameraSpec) -> None:
             f"camera {camera.name!r}: a {lens.kind} lens that turns back within its image",
             "correct the coefficients, or set max_angle_deg below where it turns",
         )
-    _require_cover(camera, rays)
+    require_sight(camera, rays)
 
 
-def _require_cover(camera: CameraSpec, rays: Rays) -> None:
+def require_sight(camera: CameraSpec, rays: Rays) -> None:
+    """Refuse a lens that sees more than `WIDEST_OF_CUBE_RAD` from its axis.
+
+    Raises:
+        InputError: It does.
+    """
     if rays.widest_rad > WIDEST_OF_CUBE_RAD:
         raise InputError(
             f"camera {camera.name!r}: a view of {np.rad2deg(rays.widest_rad):.0f} degrees from the axis",
@@ -627,6 +597,23 @@ def _ftheta_focal(lens: LensModel) -> float:
     if slope <= 0:
         return 0.0
     return 1 / slope if lens.pixel_to_angle else slope
+
+
+def focal_px_of(camera: CameraSpec) -> tuple[float, float]:
+    """Return a camera's pixels per radian on its axis, to the right and down."""
+    lens = camera.lens
+    if lens is not None and lens.kind == "ftheta":
+        return _ftheta_focal(lens), _ftheta_focal(lens)
+    return float(camera.K[0, 0]), float(camera.K[1, 1])
+
+
+def intrinsics_on_axis(camera: CameraSpec) -> F64:
+    """Return the intrinsics ``(3, 3)`` of a pinhole that shows what is on a camera's axis as the
+    camera does.
+    """
+    if camera.lens is None:
+        return camera.K
+    return intrinsics(*focal_px_of(camera), *camera.K[:2, 2])
 
 
 def _linear(lens: LensModel) -> F64:
@@ -782,7 +769,7 @@ def _covered(
     visible = None if covered.all() else covered.reshape(shape)
     place = place.reshape(*shape, 2)
     size = camera.width, camera.height
-    return Lens(*size, K, cover, place, visible, T_lens_pinhole=T, side=side, camera=camera)
+    return Lens(*size, K, cover, place, visible, T_lens_pinhole=T, side=side)
 
 
 def _require(fine: bool, name: str, problem: str) -> None:

@@ -338,8 +338,9 @@ class RecordedFrame:
     T_world_camera: F64  # (4, 4), as the reconstruction believes
     actors: Mapping[str, F64]  # actor id -> T_world_box (4, 4) of those present
     # (H, W, 3) sRGB; (H, W) metres, as the renderer sees it from there, 0 where it shows nothing or
-    # sky
+    # sky; along the optical axis, through a lens from the camera's centre
     read: Callable[[], tuple[U8, F32]]
+    lens: LensModel | None = None  # None: the pinhole K
 
 
 # --- policy

@@ -26,6 +26,7 @@ from alpasim_plugin.fixers.warp import (
     FREE_SHARE,
     RecordedImage,
     WarpTarget,
+    boxes_on_rays,
     on_boxes,
     place_boxes,
     warp,
@@ -124,7 +125,7 @@ def step_px(size: int) -> int:
 
 
 def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
-    """Return the depth of the ground ``(H, W)`` in metres along the optical axis, where a pixel of
+    """Return the depth of the ground ``(H, W)`` in metres, as the view counts it, where a pixel of
     the view may show it; elsewhere 0.
 
     It may where the ray meets the ground between `NEAREST_M` and `FARTHEST_M`, and the render has a
@@ -132,11 +133,15 @@ def ground_hypothesis(target: WarpTarget, T_world_rig: F64) -> F32:
     and the ray meets no actor's box. Arguments as of `carry`.
     """
     # A pixel p at depth z lies at the height z (down . p) + height_m above the ground.
-    down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3] @ np.linalg.inv(target.K)
+    down = T_world_rig[:3, 2] @ target.T_world_camera[:3, :3]
     height_m = T_world_rig[:3, 2] @ (target.T_world_camera[:3, 3] - T_world_rig[:3, 3])
     out = np.empty(target.depth.shape, dtype=np.float32)
-    _ground(np.ascontiguousarray(target.depth), down, height_m, out)
-    out[on_boxes(target.depth.shape, target.placed.boxes)] = 0
+    depth = np.ascontiguousarray(target.depth)
+    if target.rays is None:
+        _ground(depth, down @ np.linalg.inv(target.K), height_m, out)
+    else:
+        _ground_on_rays(target.rays, depth, down, height_m, out)
+    out[on_boxes(target.depth.shape, target.placed.boxes, target.rays)] = 0
     return out
 
 
@@ -152,13 +157,28 @@ def _ground(depth, down, height_m, out):
             out[row, column] = z if free else 0.0
 
 
+@float_kernel
+def _ground_on_rays(rays, depth, down, height_m, out):
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            x, y, z = rays[row, column]
+            slope, surface = down[0] * x + down[1] * y + down[2] * z, np.float64(depth[row, column])
+            distance = -height_m / slope if slope < 0 else 0.0
+            hides = (surface > FLOATING_M) & (surface < FREE_SHARE * distance)
+            free = (distance > NEAREST_M) & (distance < FARTHEST_M) & ~hides
+            out[row, column] = distance if free else 0.0
+
+
 def with_users(recorded: RecordedImage, boxes: Mapping[str, Box]) -> RecordedImage:
     """Return a recorded frame that knows which of its pixels show road users."""
     height, width = recorded.depth.shape
-    placed = place_boxes(
-        (height, width), recorded.K, recorded.T_world_camera, recorded.actors, boxes
-    )
-    users = on_boxes((height, width), placed.boxes)
+    world = recorded.T_world_camera, recorded.actors, boxes
+    if recorded.lens is None:
+        placed = place_boxes((height, width), recorded.K, *world)
+        users = on_boxes((height, width), placed.boxes)
+    else:
+        placed = boxes_on_rays(recorded.lens.rays, *world)
+        users = on_boxes((height, width), placed.boxes, recorded.lens.rays)
     return replace(recorded, users=users) if users.any() else recorded
 
 

@@ -1,5 +1,5 @@
-"""What a fixer gets with the frame of a lens: references are made in the pinholes that cover it. Where
-a renderer draws pinholes alone, so is the frame, and on a device the semantic map.
+"""What a fixer gets of a lens whose renderer draws pinholes alone: the frame and its references, and on
+a device the semantic map, are joined of those that cover it.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from alpasim_plugin.cameras import lens
 from alpasim_plugin.cameras.lens import Lens
-from alpasim_plugin.core.types import Frame, RenderRequest
+from alpasim_plugin.core.types import Frame
 
 
 def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame:
@@ -24,25 +24,6 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
     events = dict.fromkeys(event for frame in frames for event in frame.events)
     whole = joined_planes(sides, planes)
     return frames[0].changed(camera=camera, events=tuple(events), on_device=whole)
-
-
-def depth_frames(
-    frame: Frame, sides: Sequence[Lens], requests: Sequence[RenderRequest]
-) -> list[Frame]:
-    """Return frames of the pinholes of a lens that carry its frame's depth, for what is warped by it.
-
-    Args:
-        frame: Of the lens.
-        sides: Its pinholes.
-        requests: Of each.
-    """
-    distance = frame.depth
-    frames = []
-    for side, request in zip(sides, requests, strict=True):
-        black = np.zeros((request.camera.height, request.camera.width, 3), dtype=np.uint8)
-        depth = None if distance is None else side.depth(distance)
-        frames.append(Frame(frame.t_us, request.camera.name, black, None, depth))
-    return frames
 
 
 def joined_image(sides: Sequence[Lens], images: Sequence[Any]) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.cameras.lens import Lens, blackened, joined_references
+from alpasim_plugin.cameras.lens import Lens, blackened
 from alpasim_plugin.cameras.lens_cover import LensCover
 from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import FixerError, FixerFault, InputError
@@ -32,7 +32,7 @@ from alpasim_plugin.core.types import (
     Scenario,
     read_only,
 )
-from alpasim_plugin.fixers.lenses import depth_frames, joined, joined_image
+from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
@@ -65,9 +65,8 @@ class BlockRunner:
         threads: Threads of the map rasteriser.
         on_device: Whether the fixer takes the references and the map of a frame that a device drew
             from there.
-        cover: The pinholes that are rendered of lenses; the fixer sees the lens's image.
-        draws_lenses: Whether the base renderer draws lenses itself; references are made in the
-            pinholes all the same.
+        cover: The pinholes that are rendered of lenses where ``draws_lenses`` does not say that the
+            base renderer draws these; the fixer sees the lens's image.
         stage_ms: Time since `reset_times` by stage, without the base renderer's.
     """
 
@@ -87,22 +86,17 @@ class BlockRunner:
 
     def render(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
         """Render the frames of an instant, warp their references and draw their maps."""
-        if not self.cover.sides:
-            frames = self._with_references(requests, self.render_base(requests))
-            maps = self._maps(requests, self._map_device(frames))
-            return list(map(ConditionedFrame, requests, frames, maps))
-        cuts = [self.cover.requests(request) for request in requests]
-        if not self.draws_lenses:
-            return self._covered(requests, cuts)
-        frames = self._lens_frames(requests, cuts)
-        return list(map(ConditionedFrame, requests, frames, self._maps(requests, "cpu")))
+        if self.cover.sides and not self.draws_lenses:
+            return self._covered(requests)
+        frames = self._with_references(requests, self.render_base(requests))
+        maps = self._maps(requests, self._map_device(frames))
+        return list(map(ConditionedFrame, requests, frames, maps))
 
-    def _covered(
-        self, requests: Sequence[RenderRequest], cuts: Sequence[Sequence[RenderRequest]]
-    ) -> list[ConditionedFrame]:
+    def _covered(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
         """Render the pinholes of each lens and join their frames. The map is drawn through the lens;
         for a device, into the pinholes.
         """
+        cuts = [self.cover.requests(request) for request in requests]
         pinholes = [part for cut in cuts for part in cut]
         parts = self._with_references(pinholes, self.render_base(pinholes))
         device = self._map_device(parts)
@@ -137,32 +131,6 @@ class BlockRunner:
             return map_on_threads(
                 1 if is_pending else thread_count(self.threads), join_one, lens_parts
             )
-
-    def _lens_frames(
-        self, requests: Sequence[RenderRequest], cuts: Sequence[Sequence[RenderRequest]]
-    ) -> list[Frame]:
-        """Render frames through lenses; references are warped into the pinholes of each."""
-        frames = self.render_base(requests)
-        if self.references is None:
-            return list(frames)
-        lenses = [self.cover.sides.get(request.camera.name) for request in requests]
-        with self._timed("lens"):
-            depths = [
-                [frame] if sides is None else depth_frames(frame, sides, cut)
-                for frame, sides, cut in zip(frames, lenses, cuts, strict=True)
-            ]
-        pinholes = [part for cut in cuts for part in cut]
-        parts = iter(self._with_references(pinholes, [part for cut in depths for part in cut]))
-        out = []
-        for frame, sides, cut in zip(frames, lenses, cuts, strict=True):
-            lens_parts = [next(parts) for _ in cut]
-            if sides is None:
-                out.append(lens_parts[0])
-                continue
-            with self._timed("lens"):
-                references = joined_references(sides, lens_parts)
-            out.append(frame.changed(references=references))
-        return out
 
     def _with_references(
         self, requests: Sequence[RenderRequest], frames: Sequence[Frame]

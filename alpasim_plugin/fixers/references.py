@@ -19,14 +19,21 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from alpasim_plugin.cameras.lens import lens_camera
-from alpasim_plugin.cameras.shutter import Band, bands, joined
+from alpasim_plugin.cameras.lens import (
+    blackened,
+    exposed_bands,
+    focal_px_of,
+    intrinsics_on_axis,
+    lens_camera,
+)
+from alpasim_plugin.cameras.shutter import Band, joined
 from alpasim_plugin.core.devices import batched
 from alpasim_plugin.core.geometry import se3
 from alpasim_plugin.core.types import (
     F64,
     I64,
     Actor,
+    CameraSpec,
     DevicePlanes,
     Frame,
     RecordedFrame,
@@ -37,7 +44,8 @@ from alpasim_plugin.core.types import (
 from alpasim_plugin.fixers.ground import carry, window_px, with_users
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import planes_of
-from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget
+from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget, recorded_lens
+from alpasim_plugin.gaussians.lens_camera import blind_part, lens_rays
 from alpasim_plugin.gaussians.raster.stages import map_on_threads, thread_count
 
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
@@ -67,7 +75,9 @@ class ReferenceIndex:
         self._centres = T[:, :3, 3]
         self._axes = T[:, :3, 2]
         self._t_us: I64 = np.array([frame.t_us for frame in recorded], dtype=np.int64)
-        self._focal_px = np.array([frame.K[0, 0] for frame in recorded])
+        self._focal_px = np.array(
+            [focal_px_of(recording_camera(frame, (1, 1)))[0] for frame in recorded]
+        )
         self._lenses: dict[tuple[int, str], list[int]] = {}
         for i, frame in enumerate(recorded):
             self._lenses.setdefault((frame.t_us, lens_camera(frame.camera)), []).append(i)
@@ -117,6 +127,11 @@ class ReferenceIndex:
             usable &= self._t_us < t_us
         order = np.argsort(np.where(usable, distance, np.inf), kind="stable")[:count]
         return tuple(int(i) for i in order if usable[i])
+
+
+def recording_camera(frame: RecordedFrame, size: tuple[int, int]) -> CameraSpec:
+    """Return the camera of a recorded frame of a width and height."""
+    return CameraSpec(frame.camera, *size, frame.K, np.eye(4), 0, frame.lens)
 
 
 View = tuple[RenderRequest, Sequence[Any], F64]  # its recorded frames, and a rig's pose near by
@@ -221,14 +236,19 @@ class ReferenceSession:
     def _windows(self, request: RenderRequest, depth: Any) -> list[Window]:
         """Return the windows of a view ``(H, W)`` into which recorded frames are carried."""
         # What `carry` decides of a pixel depends on those around it.
-        around = window_px(request.camera.K)
+        K_view = intrinsics_on_axis(request.camera)
+        around = window_px(K_view)
+        rays = None
+        if request.camera.lens is not None:
+            rays = lens_rays(request.camera).ray.reshape(*depth.shape, 3)
         windows = []
-        for band in bands(request):
+        for band in exposed_bands(request):
             top = max(band.rows.start - around, 0)
-            K = request.camera.K.copy()
+            rows = slice(top, band.rows.stop + around)
+            K = K_view.copy()
             K[1, 2] -= top
-            near = depth[top : band.rows.stop + around]
-            target = WarpTarget(K, band.T_world_camera, near, band.actors, self._boxes)
+            view = K, band.T_world_camera, depth[rows], band.actors, self._boxes
+            target = WarpTarget(*view, rays=None if rays is None else rays[rows])
             inner = slice(band.rows.start - top, band.rows.stop - top), band.columns
             windows.append(Window(band, target, inner))
         return windows
@@ -262,7 +282,7 @@ class ReferenceSession:
         T_world_camera = request.T_world_camera[1]
         camera = request.camera.name
         last = self._last.get(camera, ())
-        focal_px = float(request.camera.K[0, 0])
+        focal_px = focal_px_of(request.camera)[0]
         chosen = self.index.choose(
             T_world_camera, request.t_us, self.count, last, self.past, focal_px
         )
@@ -273,7 +293,11 @@ class ReferenceSession:
 
     def _read(self, i: int) -> RecordedImage:
         frame = self.index.recorded[i]
-        recorded = RecordedImage(frame.K, frame.T_world_camera, *frame.read(), frame.actors)
+        rgb, depth = frame.read()
+        height, width = depth.shape
+        lens = recorded_lens(recording_camera(frame, (width, height)))
+        pose = frame.K, frame.T_world_camera
+        recorded = RecordedImage(*pose, rgb, depth, frame.actors, lens=lens)
         return with_users(recorded, self._boxes)
 
     def _whole_lenses(self, numbers: Sequence[int], images: Mapping[int, Any]) -> list[Any]:
@@ -313,7 +337,9 @@ def _whole(
         [image[window.inner] for image in part] for window, part in zip(windows, parts, strict=True)
     ]
     exposed = [window.band for window in windows]
-    return tuple(joined(request, exposed, images) for images in zip(*views, strict=True))
+    images = [joined(request, exposed, parts) for parts in zip(*views, strict=True)]
+    blind = blind_part(request.camera)
+    return tuple(blackened(image, blind) for image in images)
 
 
 def session_of(

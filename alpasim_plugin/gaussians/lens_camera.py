@@ -132,6 +132,14 @@ def lens_rays(spec: CameraSpec) -> Rays:
     return _lens_rays(lens_key(spec))
 
 
+def blind_part(spec: CameraSpec) -> Bool | None:
+    """Return where a camera sees nothing ``(height, width)``; None where it sees everywhere."""
+    if spec.lens is None:
+        return None
+    visible = lens_rays(spec).visible.reshape(spec.height, spec.width)
+    return None if visible.all() else ~visible
+
+
 def lens_slopes(spec: CameraSpec) -> tuple[F64, F64]:
     """Return the least and greatest ``x / z`` and ``y / z`` that a camera's lens shows, infinite
     where it sees so far from its axis that planes bound nothing, kept likewise.

@@ -7,10 +7,11 @@ ground. Lamps, snow and air are of the scene, so they are placed by the scene it
 from collections.abc import Sequence
 from functools import cached_property
 
-from alpasim_plugin.core.types import F32, RecordedFrame, RenderRequest, Scenario
-from alpasim_plugin.gaussians.camera import PinholeCamera
+import numpy as np
+
+from alpasim_plugin.core.types import F32, CameraSpec, RecordedFrame, RenderRequest, Scenario
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView
+from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph, SceneView, posed
 from alpasim_plugin.renderers.gaussian import scene_of
 from alpasim_plugin.renderers.rolling import draw_requests
 
@@ -35,7 +36,8 @@ class BuiltDepth:
 
     def of_recorded(self, frame: RecordedFrame, height: int, width: int) -> F32:
         """Return the depth ``(H, W)`` at the pose of a recorded frame, as `of_request`."""
-        camera = PinholeCamera.from_pose(width, height, frame.K, frame.T_world_camera)
+        spec = CameraSpec(frame.camera, width, height, frame.K, np.eye(4), lens=frame.lens)
+        camera = posed(spec, frame.T_world_camera)
         return self._draw([(camera, frame.actors)])[0].on_host().depth
 
     def _draw(self, views: Sequence[SceneView]) -> list[RasterOutput]:

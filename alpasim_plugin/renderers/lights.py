@@ -12,8 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from alpasim_plugin.cameras.lens import focal_px_of
 from alpasim_plugin.core.types import F32, F64, CameraSpec, Scenario
-from alpasim_plugin.renderers.view import View, depths_of, focal_px, shown_at
+from alpasim_plugin.renderers.view import View, depths_of, shown_at
 from alpasim_plugin.streets.build_facades import lit_windows, place_houses
 from alpasim_plugin.streets.build_street import lamp_posts
 from alpasim_plugin.streets.site import make_site, path_of, section_of
@@ -181,7 +182,7 @@ def in_image(spots: Sequence[Spot], camera: CameraSpec, T_world_camera: F64) -> 
         facing = -offsets[i] @ spot.facing / distance[i] if spot.facing.any() else 1.0
         if depth_m < NEAREST_M or distance[i] > SIGHT_M or facing <= 0 or not can_be_seen[i]:
             continue
-        half = focal_px(camera) * spot.half_m / depth_m * np.array([facing, 1.0])
+        half = focal_px_of(camera)[0] * spot.half_m / depth_m * np.array([facing, 1.0])
         low, high = (np.rint(16 * (pixels[i] - 0.5 + side * half)).astype(int) for side in (-1, 1))
         if (high >= -16).all() and (low <= end).all():  # a pixel more, however corners are rounded
             rectangles.append(Rectangle(spot, low.tolist(), high.tolist(), depth_m))

@@ -11,7 +11,7 @@ that the recording's camera had near by: frames look as the drive's own.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from alpasim_plugin.core.types import (
     F32,
     F64,
     STANDING_ID,
+    CameraSpec,
     Photograph,
     RecordedFrame,
     RenderRequest,
@@ -71,12 +72,28 @@ class Model:
 class ReconstructionRenderer(SplatRenderer):
     """Render a reconstruction of the scenario's logged drive; it is fitted first if it is not in
     the cache.
+
+    Args:
+        scenario: With the cameras that it is fitted to.
+        device: Where it is drawn.
+        threads: Of the CPU rasteriser; None leaves their number.
+        cameras: Those of the recording, with their lenses, where lenses are drawn; None: the
+            scenario's.
     """
 
-    def __init__(self, scenario: Scenario, device: str, threads: int | None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        device: str,
+        threads: int | None,
+        cameras: Sequence[CameraSpec] | None = None,
+    ) -> None:
         self.scenario = scenario
         self.threads = threads
         self.device = require_device(device)
+        self.cameras = tuple(scenario.cameras)
+        if cameras is not None and self.draws_lenses:
+            self.cameras = tuple(cameras)
         self.recipe = recipe_of(scenario, device)
         self.model = model_of(scenario, self.recipe, threads, device)
 
@@ -99,20 +116,29 @@ class ReconstructionRenderer(SplatRenderer):
         """Return what the scenario's cameras saw along the log, at the believed poses; the drives
         of a process share what was read.
         """
-        key = f"recording:{reconstruction_key(self.scenario, self.recipe)}"
+        recording = replace(self.scenario, cameras=self.cameras)
+        key = f"recording:{reconstruction_key(recording, self.recipe)}"
         return in_memory(
             key,
             lambda: built_recording(
-                self.scenario, scene_of(self.scenario), self.model.graph.render, self.recipe
+                self.scenario,
+                scene_of(self.scenario),
+                self.model.graph.render,
+                self.recipe,
+                self.cameras,
             ),
         )
 
 
 def reconstruction_renderer(
-    scenario: Scenario, seed: int, device: str, threads: int | None
+    scenario: Scenario,
+    seed: int,
+    device: str,
+    threads: int | None,
+    cameras: Sequence[CameraSpec] | None = None,
 ) -> Renderer:
     """Make the renderer ``3dgs``: the model of an imported drive, and otherwise what the scenario's
-    degradation names.
+    degradation names; ``cameras`` as of `ReconstructionRenderer`.
 
     Raises:
         InputError: What is to be fitted is longer than `REFUSED_S`.
@@ -127,7 +153,7 @@ def reconstruction_renderer(
             f"{scenario.scene_id}: 3dgs reconstructs at most {REFUSED_S:.0f} s, the log has {log_s:.0f} s",
             "drive a part of it, or behind clean",
         )
-    return ReconstructionRenderer(scenario, device, threads)
+    return ReconstructionRenderer(scenario, device, threads, cameras)
 
 
 def model_of(

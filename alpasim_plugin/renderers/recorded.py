@@ -7,7 +7,7 @@ scene itself, twice a second. The poses are those that the reconstruction believ
 of its registration, so a recorded frame is no better placed than a user's own.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.images import AS_STORED, read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, rigid, shifted
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, F64, U8, Photograph, RecordedFrame, Scenario
+from alpasim_plugin.core.types import F32, F64, U8, CameraSpec, Photograph, RecordedFrame, Scenario
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.raster.output import RasterOutput
 from alpasim_plugin.gaussians.scene.log_views import log_actors
-from alpasim_plugin.gaussians.scene.scene_graph import SceneGraph
+from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneGraph, posed
 from alpasim_plugin.renderers.reconstruction_key import ReconstructionRecipe
 
 INTERVAL_US = 500_000  # from the log's start
@@ -37,29 +37,37 @@ TURN_RAD_PER_M = 0.044  # of the error's directions: a quarter degree with 0.1 m
 
 BYTES_PER_PX = 7  # three of colour, four of depth
 # Renders a view of the reconstruction
-Model = Callable[[PinholeCamera, Mapping[str, F64]], RasterOutput]
+Model = Callable[[Camera, Mapping[str, F64]], RasterOutput]
 # Camera, actor poses -> depth (H, W) metres, 0 where there is none
 DepthFrom = Callable[[PinholeCamera, Mapping[str, F64]], F32]
 
 
 def built_recording(
-    scenario: Scenario, scene: SceneGraph, model: Model, recipe: ReconstructionRecipe | None
+    scenario: Scenario,
+    scene: SceneGraph,
+    model: Model,
+    recipe: ReconstructionRecipe | None,
+    cameras: Sequence[CameraSpec],
 ) -> tuple[RecordedFrame, ...]:
     """Return the recording of a built scene; a frame is rendered when it is first read, and kept as
     a file would be.
 
     Args:
-        scenario: Its log, cameras and actors.
+        scenario: Its log and actors, and the cameras that the model was fitted to.
         scene: The scene as built.
         model: The reconstruction.
         recipe: How that was fitted: how far to the left its views lie, and how wrong their poses are;
             None: on the log, without error.
+        cameras: Those of the recording: the scenario's, or cameras with lenses that these cover.
     """
     log = scenario.ego_log
     times = range(int(log.t_us[0]) + FIRST_US, int(log.t_us[-1]), INTERVAL_US)
     T_rig_offset = shifted(0.0, recipe.lateral_offset_m if recipe else 0.0)
-    largest = max((spec.width * spec.height for spec in scenario.cameras), default=1)
-    shots: list[tuple[PinholeCamera, PinholeCamera, Mapping[str, F64]]] = []
+    largest = max((spec.width * spec.height for spec in cameras), default=1)
+    firsts: dict[str, F64] = {}  # mounting of the first pinhole of each camera
+    for spec in scenario.cameras:
+        firsts.setdefault(lens_camera(spec.name), spec.T_rig_camera)
+    shots: list[tuple[Camera, Camera, Mapping[str, F64]]] = []
 
     @lru_cache(maxsize=max(1, KEPT_BYTES // (largest * BYTES_PER_PX)))
     def read(number: int) -> tuple[U8, F32]:
@@ -70,19 +78,20 @@ def built_recording(
     frames = []
     for t_us in times:
         actors = log_actors(scenario, t_us)
-        firsts: dict[str, F64] = {}
-        for spec in scenario.cameras:
-            T_world_camera = interpolate(log, t_us) @ T_rig_offset @ spec.T_rig_camera
-            true = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
+        T_world_rig = interpolate(log, t_us) @ T_rig_offset
+        for spec in cameras:
+            T_world_camera = T_world_rig @ spec.T_rig_camera
+            true = posed(spec, T_world_camera)
             T_world_believed = T_world_camera
             if recipe:
-                first = firsts.setdefault(lens_camera(spec.name), true.T_camera_world)
+                first = inverse(T_world_rig @ firsts[lens_camera(spec.name)])
                 key = scenario.scene_id, recipe.splat.seed, recipe.pose_error_m, spec.name, t_us
                 T_world_believed = inverse(believed_pose(true.T_camera_world, first, *key))
-            believed = PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_believed)
+            believed = posed(spec, T_world_believed)
             once = partial(read, len(shots))
             shots.append((true, believed, actors))
-            frames.append(RecordedFrame(t_us, spec.name, spec.K, T_world_believed, actors, once))
+            content = spec.K, T_world_believed, actors, once, spec.lens
+            frames.append(RecordedFrame(t_us, spec.name, *content))
     return tuple(frames)
 
 

@@ -19,10 +19,10 @@ from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
-from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
-from alpasim_plugin.gaussians.lens_camera import LensCamera, lens_rays
+from alpasim_plugin.gaussians.camera import Rolling
+from alpasim_plugin.gaussians.lens_camera import lens_rays
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneView, pinhole_of
+from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneView, pinhole_of, posed
 
 NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still looked for in full
 JUDGED_RAYS = 200  # of a lens, by which the motion in its image is bounded
@@ -143,7 +143,4 @@ def _motion_px(request: RenderRequest) -> float:
 
 def camera_at(request: RenderRequest, T_world_camera: F64) -> Camera:
     """Return the request's camera at a pose."""
-    spec = request.camera
-    if spec.lens is not None:
-        return LensCamera.from_pose(spec, T_world_camera)
-    return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
+    return posed(request.camera, T_world_camera)

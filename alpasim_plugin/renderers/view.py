@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 
 from alpasim_plugin.cameras.lens import projected
-from alpasim_plugin.core.geometry import intrinsics
 from alpasim_plugin.core.types import F32, F64, Bool, Box, CameraSpec, HeightField
 from alpasim_plugin.gaussians.lens_camera import lens_rays
 from alpasim_plugin.world.ground import height_at
@@ -64,20 +63,6 @@ def shown_at(camera: CameraSpec, points: F64) -> tuple[F64, Bool]:
     is_ahead = points[:, 2] > 0
     uvw = points @ camera.K.T
     return uvw[:, :2] / np.where(is_ahead, uvw[:, 2], 1.0)[:, None], is_ahead
-
-
-def focal_px(camera: CameraSpec) -> float:
-    """Return a camera's pixels per radian on its axis, to the right."""
-    return float(camera.K[0, 0]) if camera.lens is None else lens_rays(camera).focal[0]
-
-
-def intrinsics_on_axis(camera: CameraSpec) -> F64:
-    """Return the intrinsics ``(3, 3)`` of a pinhole that shows what is on a camera's axis as the
-    camera does.
-    """
-    if camera.lens is None:
-        return camera.K
-    return intrinsics(*lens_rays(camera).focal, *camera.K[:2, 2])
 
 
 def _rays_of(camera: CameraSpec, shape: tuple[int, int]) -> tuple[F32, F32]:

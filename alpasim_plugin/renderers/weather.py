@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from alpasim_plugin.cameras.lens import blackened
+from alpasim_plugin.cameras.lens import blackened, intrinsics_on_axis
 from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.geometry import interpolate, inverse
@@ -34,7 +34,7 @@ from alpasim_plugin.core.types import (
     RenderRequest,
     Scenario,
 )
-from alpasim_plugin.gaussians.lens_camera import lens_rays
+from alpasim_plugin.gaussians.lens_camera import blind_part
 from alpasim_plugin.renderers.built_depth import BuiltDepth
 from alpasim_plugin.renderers.gaussian import CleanRenderer
 from alpasim_plugin.renderers.lights import SceneLights, Spot, drawn, in_image
@@ -43,7 +43,6 @@ from alpasim_plugin.renderers.snow import ALBEDO, SnowCover
 from alpasim_plugin.renderers.view import (
     View,
     depths_of,
-    intrinsics_on_axis,
     shown_at,
     view_of,
 )
@@ -95,6 +94,7 @@ class WeatherRenderer(Renderer):
         seed: The rollout's, of the drops.
         device: Where the depth of a built scene is drawn.
         threads: Of the CPU rasteriser; None leaves their number.
+        cameras: Those that the base renderer draws; None: the scenario's.
 
     Raises:
         RendererError: A frame without depth.
@@ -107,7 +107,12 @@ class WeatherRenderer(Renderer):
         seed: int,
         device: str = "cpu",
         threads: int | None = None,
+        cameras: Sequence[CameraSpec] | None = None,
     ) -> None:
+        self.mounts = {
+            camera.name: camera.T_rig_camera
+            for camera in (scenario.cameras if cameras is None else cameras)
+        }
         self.base, self.scenario, self.seed = complete(base, Renderer), scenario, seed
         self.lookahead = self.base.lookahead
         self.block = self.base.block
@@ -177,32 +182,28 @@ class WeatherRenderer(Renderer):
         )
         T_world_rig = T_world_camera @ inverse(camera.T_rig_camera)
         weathered = self._in_weather(rgb, depth, taken, camera, T_world_rig)
-        if camera.lens is not None:
-            blind = ~lens_rays(camera).visible.reshape(camera.height, camera.width)
-            weathered = blackened(weathered, blind)
-        return replace(frame, rgb=weathered)
+        return replace(frame, rgb=blackened(weathered, blind_part(camera)))
 
     def _recorded(self, frame: RecordedFrame) -> tuple[U8, F32]:
         """Return a recorded image in this weather, and its depth as the renderer sees it; the ego is
         where its camera's mount says, and where the log says for a camera that the scenario does
         not mount.
         """
-        mounts = {camera.name: camera.T_rig_camera for camera in self.scenario.cameras}
         log = self.scenario.ego_log
         T_world_rig = (
-            frame.T_world_camera @ inverse(mounts[frame.camera])
-            if frame.camera in mounts
+            frame.T_world_camera @ inverse(self.mounts[frame.camera])
+            if frame.camera in self.mounts
             else interpolate(log, np.clip(frame.t_us, log.t_us[0], log.t_us[-1]))
         )
         rgb, seen_depth = frame.read()
         height, width = seen_depth.shape
-        pinhole = CameraSpec(frame.camera, width, height, frame.K, np.eye(4))
-        if self._is_as_rendered(pinhole, frame.T_world_camera, frame.actors, frame.t_us):
+        camera = CameraSpec(frame.camera, width, height, frame.K, np.eye(4), lens=frame.lens)
+        if self._is_as_rendered(camera, frame.T_world_camera, frame.actors, frame.t_us):
             return rgb, seen_depth
         depth = seen_depth
         if self.built is not None:
             depth = self.built.of_recorded(frame, height, width)
-        return self._in_weather(rgb, depth, frame, pinhole, T_world_rig), seen_depth
+        return self._in_weather(rgb, depth, frame, camera, T_world_rig), seen_depth
 
     def _is_as_rendered(
         self,
@@ -365,9 +366,10 @@ def in_weather(
     seed: int,
     device: str = "cpu",
     threads: int | None = None,
+    cameras: Sequence[CameraSpec] | None = None,
 ) -> Renderer:
     """Return a renderer in the weather of a scene; itself where nothing of it is seen."""
-    weather_renderer = WeatherRenderer(renderer, scenario, seed, device, threads)
+    weather_renderer = WeatherRenderer(renderer, scenario, seed, device, threads, cameras)
     return (
         renderer
         if weather_renderer.is_clear and not weather_renderer.lights.signals

@@ -44,10 +44,12 @@ def make_renderer(
     cover = LensCover(scenario.cameras)
     pinhole_scenario = cover.drawn(scenario)
     session = {"seed": seed, "device": device, "threads": threads}
-    built: Renderer = complete(build(spec.base, scenario=pinhole_scenario, **session), Renderer)
+    arguments = {"scenario": pinhole_scenario, "cameras": scenario.cameras}
+    built: Renderer = complete(build(spec.base, **arguments, **session), Renderer)
     from alpasim_plugin.renderers.weather import in_weather  # loads the builders of streets
 
-    base = in_weather(built, pinhole_scenario, seed, device, threads)
+    cameras = scenario.cameras if built.draws_lenses else pinhole_scenario.cameras
+    base = in_weather(built, pinhole_scenario, seed, device, threads, cameras)
     if spec.fixer is None:
         has_lens = any(camera.lens is not None for camera in scenario.cameras)
         return LensRenderer(base, cover) if has_lens and not base.draws_lenses else base

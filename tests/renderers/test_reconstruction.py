@@ -134,7 +134,7 @@ def test_a_recording_keeps_so_many_pictures_as_its_memory_holds(fitted, monkeypa
     scene = scene_of(fitted.scenario)
     model = fitted.model.graph.render
     first, second, third = recorded.built_recording(
-        fitted.scenario, scene, model, recipe_of(fitted.scenario)
+        fitted.scenario, scene, model, recipe_of(fitted.scenario), fitted.scenario.cameras
     )[:3]
     was = first.read()
     second.read()

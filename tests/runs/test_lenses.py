@@ -97,14 +97,13 @@ class LensDirections(Renderer):
         return Frame(request.t_us, spec.name, rgb.reshape(*shape, 3), None, depth)
 
 
-class Kept:
-    """References that say from which depth they would be warped."""
+class Depths:
+    """References that say from which depth they would be carried."""
 
     def added(self, requests, frames, on_device):
         out = []
         for request, frame in zip(requests, frames, strict=True):
-            assert request.camera.lens is None
-            assert frame.size == (request.camera.height, request.camera.width)
+            assert request.camera.lens is not None
             rgba = np.full((*frame.size, 4), 255, dtype=np.uint8)
             rgba[..., 0] = np.round(10 * frame.depth)
             out.append(frame.changed(references=(rgba,)))
@@ -123,7 +122,7 @@ def test_a_fixer_over_a_renderer_of_lenses_has_maps_and_references_of_the_same_l
         LensDirections().render_batch,
         scene_map,
         (),
-        references=Kept(),
+        references=Depths(),
         cover=cover,
         draws_lenses=True,
     )
@@ -136,6 +135,4 @@ def test_a_fixer_over_a_renderer_of_lenses_has_maps_and_references_of_the_same_l
     off = np.abs(seen.frame.rgb.astype(int) - joined.frame.rgb)[visible]
     assert np.mean(off <= 2) > 0.995
     (reference,) = seen.frame.references
-    ahead = reference[75, 100, 0]
-    assert abs(int(ahead) - 50) <= 1
-    assert (reference[..., 0][visible] > 30).mean() > 0.99
+    assert (reference[..., 0] == 50).all()

@@ -120,29 +120,17 @@ class SceneEntry:
         """Render the frames of an instant with their references, which depend on the requests
         alone; what a device drew may stay there.
         """
-        frames = self.bare_frames(requests, on_device)
-        return self.with_references(requests, frames, on_device)
+        assert self.renderer is not None, "scenes without a renderer are for maps only"
+        frames = checked_frames(self.renderer, requests, on_device)
+        if self.references is None:
+            return frames
+        return self.references.added(requests, frames, on_device)
 
     @property
     def draws_lenses(self) -> bool:
         """Whether the renderer draws lenses itself, and not the pinholes that cover them."""
         assert self.renderer is not None, "scenes without a renderer are for maps only"
         return self.renderer.draws_lenses
-
-    def bare_frames(
-        self, requests: Sequence[RenderRequest], on_device: bool = False
-    ) -> list[Frame]:
-        """Render the frames of an instant without their references."""
-        assert self.renderer is not None, "scenes without a renderer are for maps only"
-        return checked_frames(self.renderer, requests, on_device)
-
-    def with_references(
-        self, requests: Sequence[RenderRequest], frames: list[Frame], on_device: bool = False
-    ) -> list[Frame]:
-        """Return frames with their references."""
-        if self.references is None:
-            return frames
-        return self.references.added(requests, frames, on_device)
 
 
 class SceneCache:
@@ -239,10 +227,10 @@ class SceneCache:
         renderer, references, reads_device = None, None, False
         if self._spec is not None:
             pinhole_scenario = LensCover(scenario.cameras).drawn(scenario)
-            built = complete(
-                build(self._spec.base, scenario=pinhole_scenario, **self._session), Renderer
-            )
-            renderer = in_weather(built, pinhole_scenario, **self._session)
+            arguments = {"scenario": pinhole_scenario, "cameras": scenario.cameras}
+            built = complete(build(self._spec.base, **arguments, **self._session), Renderer)
+            cameras = scenario.cameras if built.draws_lenses else pinhole_scenario.cameras
+            renderer = in_weather(built, pinhole_scenario, **self._session, cameras=cameras)
             settings = self._spec.fixer and self._spec.fixer.settings
             reads_device = isinstance(settings, PixelFixerSettings)
             if isinstance(settings, FixerSettings):

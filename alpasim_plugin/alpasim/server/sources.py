@@ -12,9 +12,8 @@ saw), and a mask lowers it further where it is dark:
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -32,16 +31,17 @@ from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import exposure_of, lens_exposure
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, camera_of, read_sides, straight_of
-from alpasim_plugin.cameras.lens import Lens, blind_of, joined_references
+from alpasim_plugin.cameras.lens import Lens, blind_of, require_sight
 from alpasim_plugin.cameras.shutter import at_share
 from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, project
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
-from alpasim_plugin.fixers.lenses import depth_frames, joined, joined_image
+from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
+from alpasim_plugin.gaussians.lens_camera import blind_part, lens_rays
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.schema import read_trajectory, read_transform
 from alpasim_plugin.log.wire import sensorsim_pb2
@@ -183,15 +183,18 @@ def name_in_scene(entry: SceneEntry, view: View) -> str:
     return stored_camera.name if stored_camera else view.camera
 
 
-def drawn_map(entry: SceneEntry, request: RenderRequest) -> U8 | None:
-    """Return the semantic map as the request's lens sees it; None where the fixer takes none."""
+def drawn_map(entry: SceneEntry, request: RenderRequest, device: Any = "cpu") -> Any:
+    """Return the semantic map as the request's lens, or for a device its pinhole, sees it; None where
+    the fixer takes none.
+    """
     if entry.scene_map is None:
         return None
-    (image,) = draw_exposed_maps(entry.scene_map, [request], entry.scenario.actors)
-    return np.asarray(image, dtype=np.uint8)
+    actors = entry.scenario.actors
+    (image,) = draw_exposed_maps(entry.scene_map, [request], actors, device=device)
+    return image
 
 
-def drawn_map_on_device(
+def drawn_map_of_cover(
     entry: SceneEntry, requests: Sequence[RenderRequest], sides: Sequence[Lens], device: Any
 ) -> Any:
     """Return the semantic map of a lens that a device draws in the pinholes that cover it; None where
@@ -250,37 +253,30 @@ def with_fitting_map(
     return replace(rendered, frame=frame, sdmap=None)
 
 
-# The frame of a lens without its camera's name on the wire, and what the pinhole that looks straight
-# ahead shows.
-Drawn = tuple[Frame, Callable[[], U8]]
-
-
 def _straight_ahead(pinholes: Sequence[Lens]) -> int:
     """Return the number of the pinhole that looks straight ahead."""
     return max(range(len(pinholes)), key=lambda i: float(pinholes[i].T_lens_pinhole[2, 2]))
 
 
-def _drawn_pinholes(
-    entry: SceneEntry, requests: Sequence[RenderRequest], pinholes: Sequence[Lens]
-) -> Drawn:
-    """Draw the pinholes that cover a lens, and join them."""
-    frames = entry.render(requests, entry.reads_device)
-    ahead = frames[_straight_ahead(pinholes)]
-    return joined(requests[0].camera.name, pinholes, frames), lambda: ahead.rgb
+def with_straight_map(
+    rendered: Rendered, entry: SceneEntry, spec: Any, through_lens: RenderRequest, view: View
+) -> Rendered:
+    """Check the map of a frame as `with_fitting_map`, in the pinhole that shows what its lens sees.
 
-
-def _drawn_lens(
-    request: RenderRequest,
-    entry: SceneEntry,
-    requests: Sequence[RenderRequest],
-    pinholes: Sequence[Lens],
-) -> Drawn:
-    """Draw a lens; recorded frames are carried into the pinholes that cover it, and joined."""
-    (frame,) = entry.bare_frames([request])
-    parts = entry.with_references(requests, depth_frames(frame, pinholes, requests))
-    frame = frame.changed(references=joined_references(pinholes, parts))
-    ahead = pinholes[_straight_ahead(pinholes)]
-    return frame, lambda: ahead.seen_in(frame.rgb)
+    Args:
+        rendered: With a map.
+        entry: Its scene.
+        spec: The lens, as the request names it.
+        through_lens: The lens, poses and road users of the frame.
+        view: For the log.
+    """
+    image = rendered.frame.rgb
+    height, width = image.shape[:2]
+    straight = straight_of(spec, width, height)
+    mount = mount_of(entry, view)
+    camera = CameraSpec(through_lens.camera.name, *straight.size, straight.K, mount)
+    in_pinhole = replace(through_lens, camera=camera)
+    return with_fitting_map(rendered, entry, in_pinhole, straight.image(image), view)
 
 
 class LocalSource:
@@ -313,29 +309,51 @@ class LocalSource:
         ]
 
     def _render(self, request: Request, view: View, left: CallTime) -> Rendered:
-        """Render the request's lens, or the pinholes that cover it, joined; and check the semantic
-        map against the pinhole that looks straight ahead.
+        """Render the request's lens, or the pinholes that cover it where the renderer draws these
+        alone; and check the semantic map.
+        """
+        spec = request.camera_intrinsics
+        camera = camera_of(spec, view.width, view.height)
+        if camera.lens is not None:
+            require_sight(camera, lens_rays(camera))
+        entry = self._scenes.get(view.scene_id, left)
+        through_lens = lens_request(entry, request, view, mount_of(entry, view))
+        if camera.lens is not None and not entry.draws_lenses:
+            return self._render_cover(entry, request, through_lens, view, left)
+        with left.holding(self._busy):
+            (frame,) = entry.render([through_lens], entry.reads_device)
+            sdmap = drawn_map(entry, through_lens, frame.device if entry.reads_device else "cpu")
+        rendered = Rendered(frame.changed(camera=view.camera), sdmap, blind_part(camera))
+        if sdmap is None:
+            return rendered
+        return with_straight_map(rendered, entry, spec, through_lens, view)
+
+    def _render_cover(
+        self,
+        entry: SceneEntry,
+        request: Request,
+        through_lens: RenderRequest,
+        view: View,
+        left: CallTime,
+    ) -> Rendered:
+        """Render the pinholes that cover the request's lens, and join them; the semantic map is
+        checked in the one that looks straight ahead.
         """
         pinholes = read_sides(request.camera_intrinsics, view.width, view.height)
-        entry = self._scenes.get(view.scene_id, left)
-        mount = mount_of(entry, view)
-        requests = requests_of(entry, request, view, mount, pinholes)
-        through_lens = lens_request(entry, request, view, mount)
-        draw = _drawn_pinholes
-        if entry.draws_lenses and pinholes[0].resample is not None:
-            draw = partial(_drawn_lens, through_lens)
+        requests = requests_of(entry, request, view, mount_of(entry, view), pinholes)
         with left.holding(self._busy):
-            frame, ahead = draw(entry, requests, pinholes)
+            frames = entry.render(requests, entry.reads_device)
+            frame = joined(requests[0].camera.name, pinholes, frames)
             device = frame.device if entry.reads_device else "cpu"
             if implementation(device, True, False):
                 sdmap = drawn_map(entry, through_lens)
             else:
-                sdmap = drawn_map_on_device(entry, requests, pinholes, device)
+                sdmap = drawn_map_of_cover(entry, requests, pinholes, device)
         rendered = Rendered(frame.changed(camera=view.camera), sdmap, blind_of(pinholes))
         if sdmap is None:
             return rendered
-        index = _straight_ahead(pinholes)
-        return with_fitting_map(rendered, entry, requests[index], ahead(), view)
+        ahead = _straight_ahead(pinholes)
+        return with_fitting_map(rendered, entry, requests[ahead], frames[ahead].rgb, view)
 
     def scan(self, view: View, cameras: Sequence[CameraSpec], left: CallTime) -> list[Frame]:
         """Return frames with depth of several cameras at the view's place, at its shutter end.
@@ -473,17 +491,9 @@ class UpstreamSource:
             through_lens = lens_request(entry, bare_request, sized, np.eye(4))
             sdmap = drawn_map(entry, through_lens)
             if sdmap is not None:
-                straight = straight_of(bare_request.camera_intrinsics, width, height)
-                mounted = straight.K, mount_of(entry, view)
-                camera = CameraSpec(view.camera, *straight.size, *mounted)
-                straight_image = straight.image(rgb)
-                rendered = with_fitting_map(
-                    replace(rendered, sdmap=sdmap),
-                    entry,
-                    replace(through_lens, camera=camera),
-                    straight_image,
-                    view,
-                )
+                spec = bare_request.camera_intrinsics
+                with_map = replace(rendered, sdmap=sdmap)
+                rendered = with_straight_map(with_map, entry, spec, through_lens, view)
         return rendered
 
     def _trust_in(self, view: View, left: CallTime) -> float:

@@ -58,7 +58,10 @@ KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind(
-            "renderer", "simrun.renderers", interfaces.Renderer, ("scenario", *SESSION, "address")
+            "renderer",
+            "simrun.renderers",
+            interfaces.Renderer,
+            ("scenario", "cameras", *SESSION, "address"),
         ),
         Kind("fixer", "simrun.fixers", interfaces.Fixer, ("settings", "scene_id", *SESSION)),
         Kind("policy", "simrun.policies", interfaces.Policy, ("scenario", "address")),

@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 
-from alpasim_plugin.cameras.image_map import DEGREE, ImageMap
+from alpasim_plugin.cameras.image_map import ImageMap
+from alpasim_plugin.cameras.image_map_kernel import MAP_SIZE, lens_pixel, map_numbers
 from alpasim_plugin.core.kernels import kernel
 from alpasim_plugin.core.types import F64, CameraSpec
 from alpasim_plugin.fixers.semantic_map.kernels import (
@@ -40,22 +41,15 @@ BENT_PX = 0.1  # by how much a piece may leave its curve
 LONGEST_RAD = 0.06  # of a piece, which its depth is nearly even over
 SHORTEST_RAD = 0.01
 DEEPEST = 64  # triangles that wait while one is divided
-# Entries of a lens: its middle, linear part, s_most, terms beside the radius, and polynomial; the
-# image's size, pixels of it for one of the style; the longest piece; the angle up to which points
-# are shown.
-MIDDLE, LINEAR, S_MOST, BENT, POLYNOMIAL = 0, 2, 6, 7, 13
-WIDTH = POLYNOMIAL + DEGREE + 1
-HEIGHT, SCALE, PIECE, SHOWN_RAD, SIZE = range(WIDTH + 1, WIDTH + 6)
+# Entries of a lens: those of `image_map_kernel`; the image's size, pixels of it for one of the style;
+# the longest piece; the angle up to which points are shown.
+WIDTH, HEIGHT, SCALE, PIECE, SHOWN_RAD, SIZE = range(MAP_SIZE, MAP_SIZE + 6)
 
 
 def lens_numbers(camera: CameraSpec, lens_map: ImageMap) -> F64:
     """Return a camera's lens ``(SIZE,)`` as the kernels read it."""
     numbers = np.zeros(SIZE)
-    numbers[MIDDLE : MIDDLE + 2] = lens_map.middle
-    numbers[LINEAR : LINEAR + 4] = lens_map.linear.ravel()
-    numbers[S_MOST] = lens_map.s_most
-    numbers[BENT : BENT + 6] = lens_map.bent
-    numbers[POLYNOMIAL : POLYNOMIAL + DEGREE + 1] = lens_map.polynomial
+    numbers[:MAP_SIZE] = map_numbers(lens_map)
     numbers[WIDTH] = camera.width
     numbers[HEIGHT] = camera.height
     numbers[SCALE] = camera.width / WIDTH_DEFINED_AT_PX
@@ -63,42 +57,6 @@ def lens_numbers(camera: CameraSpec, lens_map: ImageMap) -> F64:
     numbers[PIECE] = min(max(piece, SHORTEST_RAD), LONGEST_RAD)
     numbers[SHOWN_RAD] = 2 * math.atan(math.sqrt(lens_map.s_most))
     return numbers
-
-
-@kernel
-def lens_pixel(lens, x, y, z):
-    """Return the pixel (u, v) of a point, with the ray held to where the lens is described; see
-    `cameras.image_map`.
-    """
-    n = math.sqrt(x * x + y * y + z * z)
-    inverse = 1.0 / max(n + z, 1e-9 * n + 1e-30)
-    hx = x * inverse
-    hy = y * inverse
-    s = hx * hx + hy * hy
-    if s > lens[S_MOST]:
-        shrink = math.sqrt(lens[S_MOST] / s)
-        hx *= shrink
-        hy *= shrink
-        s = lens[S_MOST]
-    t = 2.0 * s / lens[S_MOST] - 1.0
-    g = lens[POLYNOMIAL + DEGREE]
-    for k in range(DEGREE - 1, -1, -1):
-        g = g * t + lens[POLYNOMIAL + k]
-    px = g * hx
-    py = g * hy
-    if lens[BENT : BENT + 6].any():
-        k = 2.0 / (1.0 - s)
-        ax = hx * k
-        ay = hy * k
-        r2 = ax * ax + ay * ay
-        p1, p2 = lens[BENT], lens[BENT + 1]
-        px += 2.0 * p1 * ax * ay + p2 * (r2 + 2.0 * ax * ax)
-        px += r2 * (lens[BENT + 2] + r2 * lens[BENT + 3])
-        py += p1 * (r2 + 2.0 * ay * ay) + 2.0 * p2 * ax * ay
-        py += r2 * (lens[BENT + 4] + r2 * lens[BENT + 5])
-    u = lens[LINEAR] * px + lens[LINEAR + 1] * py + lens[MIDDLE]
-    v = lens[LINEAR + 2] * px + lens[LINEAR + 3] * py + lens[MIDDLE + 1]
-    return u, v
 
 
 @kernel

@@ -30,7 +30,7 @@ import numpy as np
 from alpasim_plugin.core.detail import halvings_of
 from alpasim_plugin.core.devices import batched, implementation
 from alpasim_plugin.core.errors import InputError, RendererError
-from alpasim_plugin.core.types import F64, I64, Bool, FloatArray
+from alpasim_plugin.core.types import F64, I64, Bool, CameraSpec, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
 from alpasim_plugin.gaussians.constants import MIP_PX2
@@ -396,6 +396,13 @@ def _level(node: SceneNode, allowed_m: float, halvings: int) -> int | None:
     if fit:
         return fit[-1]
     return level_numbers[0] if level_numbers else None
+
+
+def posed(spec: CameraSpec, T_world_camera: F64) -> Camera:
+    """Return a camera at a pose ``(4, 4)``, with its lens if it has one."""
+    if spec.lens is not None:
+        return LensCamera.from_pose(spec, T_world_camera)
+    return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
 
 
 def pinhole_of(camera: Camera) -> PinholeCamera:
