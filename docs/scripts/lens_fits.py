@@ -2,13 +2,14 @@
 freed of their distortion first. Both models are compared with photographs that neither saw, in the lens's
 own image: in all of it, where the image without distortion reaches, and beyond.
 
-Usage: python docs/scripts/lens_fits.py [--steps N] [--count N] [--images FOLDER]
+Usage: python docs/scripts/lens_fits.py [--steps N] [--count N] [--width PIXELS] [--images FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,9 +17,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from lens_times import seen_through
+import yaml
+from lens_times import STREET
 from pages import table
 
+from alpasim_plugin import load_scenario
 from alpasim_plugin.core.geometry import interpolate
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import U8, Bool, RenderRequest
@@ -31,19 +34,28 @@ from alpasim_plugin.runs.renderer import make_renderer
 
 CAMERAS = {
     "OpenCV, k1 = -0.3": {
-        "lens": "opencv", "width": 480, "height": 304, "hfov_deg": 100,
-        "coefficients": [-0.3, 0.08, 0, 0],
+        "lens": "opencv", "hfov_deg": 100, "coefficients": [-0.3, 0.08, 0, 0],
     },
-    "fisheye, 150 degrees": {"lens": "fisheye", "width": 480, "height": 360, "hfov_deg": 150},
+    "fisheye, 150 degrees": {"lens": "fisheye", "hfov_deg": 150},
 }  # fmt: skip
 EVERY = 8  # photographs, of which one is held out
 WAY_S = 6.0
 HEAD = ["lens", "fitted", "all, dB", "inside, dB", "beyond, dB", "beyond, share", "CPU, s"]
 
 
-def photographs(name: str, count: int) -> list[PosedView]:
+def photographs(name: str, count: int, width: int) -> list[PosedView]:
     """Return what a camera sees along the street without road users, through its lens."""
-    scenario = seen_through(CAMERAS[name])
+    camera = {"name": "lens", "width": width, "height": width * 5 // 8, **CAMERAS[name]}
+    scene = {
+        "version": 1,
+        "extends": [str(STREET)],
+        "scene_id": "lens-fits",  # of which the street's houses depend
+        "cameras": [camera],
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "lens-fits.yaml"
+        path.write_text(yaml.safe_dump(scene), encoding="utf-8")
+        scenario = load_scenario(path)
     renderer = make_renderer("clean", scenario)
     spec = scenario.cameras[0]
     begin = int(scenario.ego_log.t_us[0])
@@ -51,9 +63,9 @@ def photographs(name: str, count: int) -> list[PosedView]:
     for i, t_us in enumerate(np.linspace(begin, begin + 1e6 * WAY_S, count).astype(np.int64)):
         T = interpolate(scenario.ego_log, int(t_us)) @ spec.T_rig_camera
         frame = renderer.render(RenderRequest(int(t_us), spec, np.stack([T] * 2), {}))
-        camera = Lens.of(spec).camera(name, T)
-        mask = None if camera.visible.all() else camera.visible
-        views.append(PosedView(camera, frame.rgb, f"lens-{i:06d}", mask=mask, t_us=int(t_us)))
+        through = Lens.of(spec).camera(name, T)
+        mask = None if through.visible.all() else through.visible
+        views.append(PosedView(through, frame.rgb, f"lens-{i:06d}", mask=mask, t_us=int(t_us)))
     return views
 
 
@@ -71,9 +83,10 @@ def rendered(views: Sequence[PosedView], held: Sequence[PosedView], steps: int) 
     return images
 
 
-def row_of(name: str, way: str, count: int, steps: int, images: Path | None) -> list[str]:
-    """Return the row of a lens and a way to fit."""
-    views = photographs(name, count)
+def row_of(
+    name: str, way: str, views: Sequence[PosedView], steps: int, images: Path | None
+) -> list[str]:
+    """Return the row of a lens and a way to fit to its photographs."""
     held = views[EVERY // 2 :: EVERY]
     fitted = [view for view in views if view not in held]
     if way == "without distortion":
@@ -105,11 +118,14 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=1300)
     parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--width", type=int, default=480)
     parser.add_argument("--images", type=Path)
     options = parser.parse_args()
     rows = []
     for lens_name in CAMERAS:
+        taken = photographs(lens_name, options.count, options.width)
         for chosen in ("through the lens", "without distortion"):
             print(f"{lens_name}, {chosen}", file=sys.stderr)
-            rows.append(row_of(lens_name, chosen, options.count, options.steps, options.images))
+            rows.append(row_of(lens_name, chosen, taken, options.steps, options.images))
+            print(rows[-1], file=sys.stderr)
     print(table(HEAD, rows))
