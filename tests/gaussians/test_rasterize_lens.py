@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -248,6 +250,15 @@ def test_columns_exposed_backwards_are_those_of_the_definition():
     )
     seen = LensCamera(plain.spec, plain.T_camera_world, rolling)
     check([(cloud_of(around(100, 17), (0.3, 0.1, 0.2)), None)], seen)
+
+
+def test_cameras_keep_the_rays_of_their_lenses():
+    """A fit whose photographs have a lens each would make them again in each update."""
+    plain = spec("fisheye")
+    turns = [np.diag([1 + 1e-3 * k, 1.0, 1.0]) for k in range(10)]
+    cameras = [LensCamera(replace(plain, K=turn @ plain.K), np.eye(4)) for turn in turns]
+    tables = [tile_rays(seen) for seen in cameras]
+    assert all(tile_rays(seen) is table for seen, table in zip(cameras, tables, strict=True))
 
 
 def test_other_backends_refuse_a_lens():

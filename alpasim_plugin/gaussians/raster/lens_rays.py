@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -73,9 +74,17 @@ class TileRays:
     lens: F64
 
 
+_of_cameras: WeakKeyDictionary[LensCamera, TileRays] = WeakKeyDictionary()
+
+
 def tile_rays(camera: LensCamera) -> TileRays:
-    """Return the rays of a camera's lens, kept for the next camera with that lens."""
-    return _tile_rays(lens_key(camera.spec))
+    """Return the rays of a camera's lens, kept as long as the camera, which a fit needs whose photographs
+    have a lens each, and for the next camera with that lens.
+    """
+    table = _of_cameras.get(camera)
+    if table is None:
+        table = _of_cameras[camera] = _tile_rays(lens_key(camera.spec))
+    return table
 
 
 @lru_cache(maxsize=8)
