@@ -2,8 +2,9 @@
 BASE``; and what the first run of the README's main job waits for: ``python -m tests.speed
 --first-run``.
 
-Processes of both commits take turns on one thread, by processor time, so that a busy machine slows
-both; a ratio is the median of those of the pairs. Numbers are printed and nothing is judged by them.
+Processes of both commits take turns on one processor, by processor time, so that a busy machine
+slows both, with the fixer in one precision; a ratio is the median of those of the pairs. Numbers
+are printed and nothing is judged by them.
 The commit is checked out beside this one for the time of the measurement. Where it needs libraries
 of its own, ``--base-python`` names an interpreter that has them.
 
@@ -31,8 +32,12 @@ REPO = Path(__file__).resolve().parents[1]
 RENDERERS = ("clean", "3dgs", "onefixer")
 Costs = Mapping[str, float]  # milliseconds of processor time by what was measured
 
+# The precision of the fixer, of both commits: earlier ones choose it by the clock.
+PRECISION = "fp32"
 # Names that both commits have; what a frame costs is the least of equal drives, pass by pass.
-LOOP = """
+LOOP = (
+    f"PRECISION = {PRECISION!r}"
+    + """
 import json, sys, time
 from unittest.mock import patch
 import numba, torch
@@ -45,7 +50,8 @@ for renderer in sys.argv[1:]:
     drives = []
     for _ in range(3):
         loop.clear_cache("recording:")
-        session = loop.make_renderer(renderer, scenario, threads=1)
+        overrides = ["precision=" + PRECISION] if renderer == "onefixer" else []
+        session = loop.make_renderer(renderer, scenario, threads=1, overrides=overrides)
         clock = patch.object(time, "perf_counter", time.process_time)
         with clock, loop.Recorder(scenario) as recorder:
             policy = loop.make_policy(loop.POLICY, scenario)
@@ -57,6 +63,7 @@ for renderer in sys.argv[1:]:
         costs[f"{renderer}: {stage}"] = sum(map(min, passes)) / frames
 print(json.dumps(costs))
 """
+)
 RASTER = """
 import json, time
 import numba, numpy as np
@@ -84,11 +91,16 @@ for count, width, height in ((100_000, 480, 272), (500_000, 960, 544)):
 print(json.dumps(costs))
 """
 # A whole warm command, in one process so that all of its processor time is counted.
-JOB = """
+JOB = (
+    f"PRECISION = {PRECISION!r}"
+    + """
 import json, pathlib, resource, subprocess, sys, tempfile
 names = ",".join(sys.argv[1:])
 command = [sys.executable, "-m", "alpasim_plugin.cli.main", "--renderer", names]
-command += ["--policy", "lane-camera", "--workers", "1", "smoke/curve", "--out"]
+command += ["--policy", "lane-camera", "--workers", "1", "smoke/curve"]
+if "onefixer" in names:
+    command += ["--set", "fixer.precision=" + PRECISION]
+command += ["--out"]
 with tempfile.TemporaryDirectory() as folder:
     done = subprocess.run([*command, folder + "/run"], capture_output=True, text=True)
     manifests = pathlib.Path(folder, "run", "rollouts").rglob("manifest.json")
@@ -98,6 +110,7 @@ if done.returncode not in (0, 1) or whole < len(sys.argv) - 1:
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(json.dumps({"main job": 1e3 * (used.ru_utime + used.ru_stime)}))
 """
+)
 
 
 FIRST = "first"
@@ -139,10 +152,24 @@ def costs_of(tree: Path, python: str, cache: Path, renderers: Sequence[str]) -> 
     for script, arguments in ((RASTER, ()), (LOOP, renderers), (JOB, renderers)):
         command = [python, "-c", script, *arguments]
         done = subprocess.run(
-            command, check=True, stdout=subprocess.PIPE, text=True, env=environment, cwd=cache
+            command,
+            check=True,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            cwd=cache,
+            preexec_fn=use_one_processor,
         )
         costs |= json.loads(done.stdout.splitlines()[-1])
     return costs
+
+
+def use_one_processor() -> None:
+    """Keep this process, and those that it starts, to one of the processors that it may use: what
+    shares its work among all of them then takes one thread.
+    """
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 class Wait(NamedTuple):
