@@ -85,10 +85,13 @@ def rasterize_prepared(
     ids = np.empty(room, dtype=np.int64)
     workers = threads if room > WORTH_THREADS else 1
     cursor = np.zeros(len(parts) + 1, dtype=np.int64)
+    groups = [len(prepared.index) // 16 for prepared, _ in nodes]
 
     def project() -> None:
         for number, part in enumerate(parts):
-            project_part(cursor, number, *part, view, records, ids)
+            # A call costs more than the check whether another thread has taken the whole part.
+            if cursor[number + 1] < groups[number]:
+                project_part(cursor, number, *part, view, records, ids)
 
     run_on_threads(workers, project)
     count = int(cursor[0])
