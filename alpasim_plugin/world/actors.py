@@ -3,7 +3,7 @@ closed.
 
 Replayed actors exist exactly during their track; some wait for the ego on it. Reactive drivers follow their track until the loop
 closes, then drive along the same line, on along the lanes where it ends, and leave the scene at the
-end of the map. Where a track turns back on itself, as into a parking place, they stop and stand.
+end of the map; some change lanes. Where a track turns back on itself, as into a parking place, they stop and stand.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ from alpasim_plugin.world.idm import (
     moved_on,
     wanted_gap_m,
 )
+from alpasim_plugin.world.lane_change import KEPT_M, LanesBeside, gain_mps2
 from alpasim_plugin.world.path import Lines, Path, polyline_path, smoothstep, thinned
 from alpasim_plugin.world.route import LaneIndex
 from alpasim_plugin.world.signals import LightAhead, give_way_gap_m, lights_on, red_gap_m
@@ -64,6 +65,8 @@ FOLD = -0.5  # cosine between two steps of a track, below which it turns back on
 FADE_M = 20.0
 FADE_STEP_M = 2.0
 SPEED_SPAN_US = 100_000
+CONSIDERS_US = 500_000  # between looks at the lanes beside
+CHANGED_US = 6_000_000  # from a change to the next look
 DRIVING = ("idm", "adversary")  # behaviours of those who leave their track
 # An adversary: share of its speed between which it chooses, gain and time of its control.
 SLOWEST = 0.5
@@ -98,12 +101,11 @@ class Actors:
         reactive = [actor for actor in actors if actor.behaviour.kind in DRIVING]
         index = LaneIndex(lane_map) if lane_map is not None and reactive else None
         self.drivers = [_Driver(actor, index, ground, lane_map, closed_us) for actor in reactive]
-        for number, driver in enumerate(d for d in self.drivers if d.path is not None):
+        for number, driver in enumerate(d for d in self.drivers if d.course is not None):
             driver.line = number
-        paths = [driver.path for driver in self.drivers if driver.path is not None]
-        self._lines = Lines(paths) if paths else None
+        self._beside = None if index is None else LanesBeside(index)
         self.replayed = _Tracks([a for a in actors if a.behaviour.kind not in DRIVING])
-        self._on_tracks = _Tracks([d.actor for d in self.drivers if d.path is None])
+        self._on_tracks = _Tracks([d.actor for d in self.drivers if d.course is None])
         self.reset()
 
     def reset(self) -> None:
@@ -117,6 +119,16 @@ class Actors:
         for driver in self.drivers:
             driver.motion = None
             driver.present = True
+        self._put_on_lines()
+
+    def _put_on_lines(self) -> None:
+        """Put the ways that the reactive drivers have now into one array."""
+        courses = [
+            driver.course if driver.motion is None else driver.motion.course
+            for driver in self.drivers
+        ]
+        paths = [course.path for course in courses if course is not None]
+        self._lines = Lines(paths) if paths else None
 
     def step(self, t_us: int, ego: EgoState) -> Mapping[str, F64]:
         """Advance to ``t_us`` and return ``T_world_box`` ``(4, 4)`` of every actor present.
@@ -139,7 +151,7 @@ class Actors:
                 centre, np.array([yaw]), [self.vehicle.box], ego.speed_mps * direction, height_m
             )
             others = concatenate([ego_body, _bodies_of(replayed, poses, velocity), waiting])
-            self._advance(self._lines, max(self.t_us, self.closed_us), t_us, others)
+            self._advance(max(self.t_us, self.closed_us), t_us, others)
         for driver in self.drivers:
             pose = driver.pose(t_us, self.closed_us, driver.motion)
             if pose is not None:
@@ -157,7 +169,7 @@ class Actors:
         walkers = {key: replace(walker) for key, walker in self.walkers.items()}
         return ActorForecast(self.replayed, walkers, tuple(reactive), self.t_us, self.closed_us)
 
-    def _advance(self, lines: Lines, from_us: int, to_us: int, others: Bodies) -> None:
+    def _advance(self, from_us: int, to_us: int, others: Bodies) -> None:
         """Move all reactive drivers, who see each other and the others' bodies."""
         n = max(1, int(np.ceil((to_us - from_us) * 1e-6 / MAX_STEP_S)))
         dt_s = (to_us - from_us) * 1e-6 / n
@@ -167,21 +179,16 @@ class Actors:
             driving = [(d, d.motion) for d in self.drivers if d.motion is not None]
             if not driving:
                 return
+            lines = self._lines
+            assert lines is not None
             line = np.array([driver.line for driver, _ in driving])
-            s_m, offset_m, speed_mps = np.array(
-                [(m.s_m, m.offset_m, m.speed_mps) for _, m in driving]
-            ).T
-            boxes = [driver.actor.box for driver, _ in driving]
-            xyz, yaws = lines.at(line, s_m, offset_m)
-            directions = direction_of(yaws)
-            moving = bodies_from(
-                xyz[:, :2], yaws, boxes, speed_mps[:, None] * directions, xyz[:, 2]
-            )
+            moving = _bodies_on_lines(lines, line, driving)
             everybody = concatenate([others, moving])
+            boxes = [driver.actor.box for driver, _ in driving]
             leaders = find_leaders(
                 lines,
                 line,
-                s_m + [box.length_m / 2 for box in boxes],
+                np.array([motion.s_m for _, motion in driving]) + moving.half_length_m,
                 np.array([box.width_m / 2 for box in boxes]),
                 everybody,
                 np.array([driver.horizon_m(motion) for driver, motion in driving]),
@@ -189,10 +196,19 @@ class Actors:
                 lets_merge=True,
             )
             first_moving = len(others.xy)
+            changed = False
             for row, ((driver, motion), leader) in enumerate(zip(driving, leaders, strict=True)):
                 accel_mps2 = driver.accel_mps2(motion, leader, everybody, first_moving + row, to_us)
-                if motion.since_us <= from_us:
-                    driver.move(motion, accel_mps2, dt_s)
+                if motion.since_us > from_us:
+                    continue
+                if self._beside is not None:
+                    surroundings = (everybody, first_moving + row)
+                    changed |= driver.change_lane(
+                        self._beside, motion, accel_mps2, surroundings, to_us
+                    )
+                driver.move(motion, accel_mps2, dt_s)
+            if changed:
+                self._put_on_lines()
 
 
 @dataclass(frozen=True)
@@ -327,14 +343,53 @@ def _bodies_of(actors: Sequence[Actor], poses: F64, velocity_mps: F64) -> Bodies
     )
 
 
+def _bodies_on_lines(lines: Lines, line: I64, driving: Sequence[tuple[_Driver, _Motion]]) -> Bodies:
+    """Return reactive drivers, each on its line ``(N,)``, as bodies."""
+    s_m, offset_m, speed_mps = np.array([(m.s_m, m.offset_m, m.speed_mps) for _, m in driving]).T
+    xyz, yaws = lines.at(line, s_m, offset_m)
+    boxes = [driver.actor.box for driver, _ in driving]
+    velocity = speed_mps[:, None] * direction_of(yaws)
+    return bodies_from(xyz[:, :2], yaws, boxes, velocity, xyz[:, 2])
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A driver's way, and what stands on it.
+
+    Attributes:
+        path: Of the middle of its box.
+        lights, give_way: Lines at which to stop.
+        wanted_mps: ``(N,)`` speeds that bends allow; None: any.
+    """
+
+    path: Path
+    lights: tuple[LightAhead, ...] = ()
+    give_way: tuple[LightAhead, ...] = ()
+    wanted_mps: F64 | None = None
+
+    @classmethod
+    def along(cls, path: Path, lane_map: LaneMap | None, params: IdmParams) -> _Course:
+        """Return the way along a path of a driver on a map."""
+        if lane_map is None:
+            return cls(path)
+        return cls(
+            path,
+            lights_on(path, lane_map.signals, lane_map.lanes),
+            lights_on(path, lane_map.give_way, lane_map.lanes),
+            bend_speeds(path, params),
+        )
+
+
 @dataclass
 class _Motion:
     """Where a reactive driver is on its line."""
 
+    course: _Course
     s_m: float
     speed_mps: float
     offset_m: float  # left of the line, kept
     since_us: int  # when it left its track
+    considers_us: int = 0  # when it next looks whether to change lanes
 
 
 @dataclass(frozen=True)
@@ -390,18 +445,13 @@ class _Driver:
         self.params = IdmParams(**({} if self.act else actor.behaviour.params))
         line = _TrackLine.of(actor.track)
         self.stands_at_end = line.folds
-        self.path: Path | None = None
+        self.lane_map = lane_map
+        self.course: _Course | None = None
         takeover_us = max(closed_us, int(actor.track.t_us[0]))
         if line.is_driven(float(yaw_from_quat(actor.track.quat[0])), takeover_us):
-            self.path = _with_lanes_ahead(line, index, actor.box.height_m / 2)
+            path = _with_lanes_ahead(line, index, actor.box.height_m / 2)
+            self.course = _Course.along(path, lane_map, self.params)
             self._vertex_us = line.t_us
-        self.lights: tuple[LightAhead, ...] = ()
-        self.give_way: tuple[LightAhead, ...] = ()
-        self.wanted_mps: F64 | None = None
-        if self.path is not None and lane_map is not None:
-            self.lights = lights_on(self.path, lane_map.signals, lane_map.lanes)
-            self.give_way = lights_on(self.path, lane_map.give_way, lane_map.lanes)
-            self.wanted_mps = bend_speeds(self.path, self.params)
         self.line = -1
         self.motion: _Motion | None = None
         self.present = True
@@ -410,7 +460,7 @@ class _Driver:
         """Take the state over from the track, once, when the track has begun."""
         first = int(self.actor.track.t_us[0])
         last = int(self.actor.track.t_us[-1])
-        if self.motion is not None or not self.present or self.path is None or to_us < first:
+        if self.motion is not None or not self.present or self.course is None or to_us < first:
             return
         if from_us > last:
             self.present = False  # the track ended while the log was forced
@@ -423,18 +473,19 @@ class _Driver:
         ahead_m = self._place_on_track(hi)[0] - self._place_on_track(lo)[0]
         speed_mps = ahead_m / ((hi - lo) * 1e-6) if hi > lo else 0.0
         since_us = from_us if first <= from_us else to_us
-        self.motion = _Motion(s_m, max(0.0, speed_mps), offset_m, since_us)
+        self.motion = _Motion(self.course, s_m, max(0.0, speed_mps), offset_m, since_us)
 
     def _place_on_track(self, t_us: int) -> tuple[float, float]:
         """Return where the track is at a time: arc length on the driver's line and offset to its
         left. A track may pass the same place several times.
         """
-        assert self.path is not None
-        stations = self.path.s[: len(self._vertex_us)]
+        assert self.course is not None
+        path = self.course.path
+        stations = path.s[: len(self._vertex_us)]
         about_m = np.interp(
             t_us - self._vertex_us[0], self._vertex_us - self._vertex_us[0], stations
         )
-        return self.path.project_about(interpolate(self.actor.track, t_us)[:2, 3], float(about_m))
+        return path.project_about(interpolate(self.actor.track, t_us)[:2, 3], float(about_m))
 
     def horizon_m(self, motion: _Motion) -> float:
         """Return how far the driver looks: twice the wanted gap behind a standing leader, beyond
@@ -448,30 +499,29 @@ class _Driver:
         """Return the acceleration behind a leader and before a line to stop at; of an adversary that
         by which it acts on the ego, the first of the bodies.
         """
-        assert self.path is not None
+        course = motion.course
         speed_mps = motion.speed_mps
         front_m = motion.s_m + self.actor.box.length_m / 2
         closing_mps = speed_mps - leader.speed_mps
-        params = at_place(self.params, self.path, self.wanted_mps, motion.s_m)
+        params = at_place(self.params, course.path, course.wanted_mps, motion.s_m)
         behind = idm_acceleration(speed_mps, leader.gap_m, closing_mps, params)
         if self.act is not None:
             against = self._against_ego_mps2(motion, bodies, self.act)
             return against if leader.index <= 0 else min(against, behind)
         stop_m = min(
-            red_gap_m(self.lights, front_m, speed_mps, t_us),
-            give_way_gap_m(self.give_way, self.path, front_m, bodies, row),
+            red_gap_m(course.lights, front_m, speed_mps, t_us),
+            give_way_gap_m(course.give_way, course.path, front_m, bodies, row),
         )
         if self.stands_at_end:
-            stop_m = min(stop_m, self.path.length_m - motion.s_m + self.params.min_gap_m)
+            stop_m = min(stop_m, course.path.length_m - motion.s_m + self.params.min_gap_m)
         return min(behind, idm_acceleration(speed_mps, stop_m, speed_mps, params))
 
     def _against_ego_mps2(self, motion: _Motion, bodies: Bodies, act: Mapping[str, float]) -> float:
         """Return the acceleration of an adversary: up to the place where it acts it tries to be
         ``gap_m`` ahead of the ego, within bounds of its speed; from there on it takes another speed.
         """
-        assert self.path is not None
         act_s_m, _ = self._place_on_track(round(act["act_us"]))
-        ego_s_m = float(self.path.project(bodies.xy[:1])[0][0])
+        ego_s_m = float(motion.course.path.project(bodies.xy[:1])[0][0])
         wanted_mps = act["end_speed_mps"]
         if motion.s_m < act_s_m:
             front_m = ego_s_m + float(bodies.half_length_m[0]) + act["gap_m"]
@@ -483,13 +533,50 @@ class _Driver:
         accel = (wanted_mps - motion.speed_mps) / CONTROL_S
         return min(max(accel, -act["decel_mps2"]), MAX_ACCEL_MPS2)
 
+    def change_lane(
+        self,
+        beside: LanesBeside,
+        motion: _Motion,
+        accel_mps2: float,
+        surroundings: tuple[Bodies, int],
+        t_us: int,
+    ) -> bool:
+        """Take the way into a lane beside where that is worth it, and return whether it is.
+
+        Args:
+            beside: Finds such lanes.
+            motion: Where the driver is; its course changes.
+            accel_mps2: Its acceleration if it stays.
+            surroundings: Everybody, and the driver's row among them.
+            t_us: Now.
+        """
+        params = at_place(self.params, motion.course.path, motion.course.wanted_mps, motion.s_m)
+        free_mps2 = idm_acceleration(motion.speed_mps, np.inf, 0.0, params)
+        nothing_to_gain = not free_mps2 - accel_mps2 > params.change_gain_mps2
+        if nothing_to_gain or t_us < motion.considers_us or self.act is not None:
+            return False
+        motion.considers_us = t_us + CONSIDERS_US
+        path = motion.course.path
+        place = (path, motion.s_m, motion.speed_mps)
+        changes = beside.changes(*place, self.actor.box.height_m / 2)
+        gains = [gain_mps2(change, *place, accel_mps2, *surroundings, params) for change in changes]
+        if not gains or max(gains) <= params.change_gain_mps2:
+            return False
+        way = changes[int(np.argmax(gains))].way
+        place_xyz, _ = path.at(motion.s_m, motion.offset_m)
+        s_m, offset_m = way.project_about(place_xyz[:2], min(motion.s_m, KEPT_M))
+        motion.course = _Course.along(way, self.lane_map, self.params)
+        motion.s_m, motion.offset_m = s_m, offset_m
+        motion.considers_us = t_us + CHANGED_US
+        return True
+
     def move(self, motion: _Motion, accel_mps2: float, dt_s: float) -> None:
         """Drive on; the driver leaves the scene at the end of its line, or stands there."""
         motion.s_m, motion.speed_mps = moved_on(motion.s_m, motion.speed_mps, accel_mps2, dt_s)
-        assert self.path is not None
-        if motion.s_m > self.path.length_m and self.stands_at_end:
-            motion.s_m, motion.speed_mps = self.path.length_m, 0.0
-        if motion.s_m > self.path.length_m:
+        length_m = motion.course.path.length_m
+        if motion.s_m > length_m and self.stands_at_end:
+            motion.s_m, motion.speed_mps = length_m, 0.0
+        if motion.s_m > length_m:
             self.present = False
             self.motion = None
 
@@ -501,13 +588,15 @@ class _Driver:
             first = int(self.actor.track.t_us[0])
             last = int(self.actor.track.t_us[-1])
             on_track = (
-                first <= t_us <= last and self.present and (t_us <= closed_us or self.path is None)
+                first <= t_us <= last
+                and self.present
+                and (t_us <= closed_us or self.course is None)
             )
             return interpolate(self.actor.track, t_us) if on_track else None
-        assert self.path is not None
-        if motion.s_m > self.path.length_m and not self.stands_at_end:
+        path = motion.course.path
+        if motion.s_m > path.length_m and not self.stands_at_end:
             return None
-        xyz, yaw = self.path.at(motion.s_m, motion.offset_m)
+        xyz, yaw = path.at(motion.s_m, motion.offset_m)
         if self.ground is None:
             return se2(float(xyz[0]), float(xyz[1]), float(yaw), float(xyz[2]))
         T = ground_pose(self.ground, float(xyz[0]), float(xyz[1]), float(yaw))

@@ -29,6 +29,9 @@ class IdmParams:
     brake_mps2: float = 2.0  # comfortable
     hard_brake_mps2: float = 7.0  # what the vehicle can do; the model's own demand is cut off here
     lateral_accel_mps2: float = math.inf  # in bends, before which the driver slows down
+    change_gain_mps2: float = math.inf  # of a change of lanes that is worth it; infinite: stays
+    politeness: float = 0.2  # share of the followers' gain in that
+    safe_brake_mps2: float = 4.0  # that a change may ask of the new follower
 
 
 def wanted_gap_m(speed_mps: float, closing_mps: float, p: IdmParams) -> float:

@@ -79,17 +79,13 @@ def ways_in(signal: Signal, lanes: Mapping[str, Lane]) -> tuple[WayIn, ...]:
         signal: The line.
         lanes: The map's lanes; some of those that the line names may not be among them.
     """
-    before: dict[str, list[str]] = {key: [] for key in lanes}
-    for key, lane in lanes.items():
-        for after in lane.successors:
-            if after in before:
-                before[after].append(key)
+    before = lanes_before(lanes)
     out = []
     for key in signal.yields_to:
         if key not in lanes:
             continue
         lane_m = float(arc_lengths(lanes[key].centre[:, :2])[-1])
-        for chain in _chains_to(key, lanes, before):
+        for chain in chains_to(key, lanes, before, APPROACH_M):
             line = np.concatenate([lanes[name].centre for name in chain])
             length_m = float(arc_lengths(line[:, :2])[-1])
             stations = np.append(np.arange(0.0, length_m, STATION_M), length_m)
@@ -99,10 +95,20 @@ def ways_in(signal: Signal, lanes: Mapping[str, Lane]) -> tuple[WayIn, ...]:
     return tuple(out)
 
 
-def _chains_to(
-    key: str, lanes: Mapping[str, Lane], before: Mapping[str, list[str]]
+def lanes_before(lanes: Mapping[str, Lane]) -> dict[str, list[str]]:
+    """Return the lanes that lead to each lane."""
+    before: dict[str, list[str]] = {key: [] for key in lanes}
+    for key, lane in lanes.items():
+        for after in lane.successors:
+            if after in before:
+                before[after].append(key)
+    return before
+
+
+def chains_to(
+    key: str, lanes: Mapping[str, Lane], before: Mapping[str, list[str]], least_m: float
 ) -> list[tuple[str, ...]]:
-    """Return the chains of lanes that end with a lane, as long as `APPROACH_M` before it where lanes
+    """Return the chains of lanes that end with a lane, as long as ``least_m`` before it where lanes
     lead there.
     """
     finished: list[tuple[str, ...]] = []
@@ -110,7 +116,7 @@ def _chains_to(
     while growing and len(finished) < MOST_WAYS:
         length_m, chain = growing.pop(0)
         leading = [name for name in before[chain[0]] if name not in chain]
-        if length_m >= APPROACH_M or not leading:
+        if length_m >= least_m or not leading:
             finished.append(chain)
             continue
         for name in leading:
