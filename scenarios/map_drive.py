@@ -156,6 +156,7 @@ def _traffic(
         line,
         spec.vehicles,
         stream(draft.scene_id, draft.spec.seed, "scenario/map/vehicles"),
+        spec.lane_changes,
     )
     walkers = place_walkers(
         lane_map,

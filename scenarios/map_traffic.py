@@ -32,6 +32,7 @@ RULED_M = 60.0  # a rule is looked for so far before the place where they do
 SPEED_MPS = (7.0, 11.0)
 SLOWEST_MPS = 3.0  # whatever limits say
 BEND_MPS2 = 3.0  # lateral acceleration in bends
+CHANGE_GAIN_MPS2 = 0.2  # of a change of lanes that is worth it
 STOP_MPS2 = 2.0  # before a stop line
 STOP_ROOM_M = 3.0  # that is kept before it, and what the brake takes to act
 TRIES = 8  # for each vehicle
@@ -48,7 +49,12 @@ class _Ride:
 
 
 def place_followers(
-    lane_map: LaneMap, way: Way, line: Path, count: int, rng: np.random.Generator
+    lane_map: LaneMap,
+    way: Way,
+    line: Path,
+    count: int,
+    rng: np.random.Generator,
+    lane_changes: bool = False,
 ) -> list[Follower]:
     """Return up to ``count`` vehicles on the lanes near a route, as many as find room.
 
@@ -58,6 +64,7 @@ def place_followers(
         line: Its line.
         count: Wanted vehicles.
         rng: Where and how fast they start.
+        lane_changes: Whether they change lanes where that is worth it.
     """
     graph = LaneGraph(lane_map.lanes)
 
@@ -83,6 +90,7 @@ def place_followers(
         posted_mps = max(float(graph.limits_mps(own_way, candidate.path).min()), SLOWEST_MPS)
         wanted_mps = min(wanted_mps, posted_mps)
         params = {"desired_speed_mps": wanted_mps, "lateral_accel_mps2": BEND_MPS2}
+        params |= {"change_gain_mps2": CHANGE_GAIN_MPS2} if lane_changes else {}
         begin_mps = float(allowed_speeds(candidate.path, wanted_mps, BEND_MPS2)[0])
         front_m = SIZES["car"].length_m / 2
         if red_gap_m(candidate.lights, front_m, begin_mps, 0) < stopping_m(begin_mps):

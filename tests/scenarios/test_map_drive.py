@@ -248,6 +248,14 @@ def test_vehicles_start_apart_keep_apart_and_wait_for_red(tmp_path):
         assert all(np.hypot(*(one - other)) >= 20.0 for other in starts[:n])
 
 
+@pytest.mark.parametrize("lane_changes", [False, True])
+def test_vehicles_change_lanes_where_the_file_says_so(tmp_path, lane_changes):
+    route = (*named("1:0", "2:200"), "map.vehicles=1", f"map.lane_changes={lane_changes}".lower())
+    made = scenario(tmp_path, two_roads(light("7", 98), STOP), *route, seed=3)
+    (vehicle,) = made.actors
+    assert ("change_gain_mps2" in vehicle.behaviour.params) == lane_changes
+
+
 @pytest.mark.parametrize(
     "parts",
     [
