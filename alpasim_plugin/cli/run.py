@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -58,7 +59,8 @@ from evaluators.statistics.variants import base_named, variants_of
 from scenarios.suite import ScenarioRef, expand
 
 SHOWN_FAILURES = 5
-Planner = Callable[[Sequence[ScenarioRef]], RunPlan]
+MOMENT_S = 2.0  # what takes longer is said
+Planner = Callable[..., RunPlan]  # of scenes; `report` as `make_plan` has it
 
 EPILOG = """
 Examples:
@@ -281,7 +283,9 @@ def run(
     refs = rollouts.scenes(scenarios)
     planned = rollouts.planner(options)
     sweeps = search_options.sweeps(len(refs), execution)
-    plan = replace(planned(refs), scenario_names=scenarios, shard=rollouts.shard)
+    with Progress(quiet or as_json) as progress:
+        plan = planned(refs, report=partial(_show_reading, progress, time.monotonic()))
+    plan = replace(plan, scenario_names=scenarios, shard=rollouts.shard)
     if options.baseline is not None:
         variants = variants_of((cell.renderer.name, cell.policy.name) for cell in plan.cells)
         base_named(options.baseline, variants, "the run")
@@ -302,6 +306,12 @@ def run(
         raise typer.Exit(search.outcome.exit_code)
     _print_result(result, plan, as_json)
     raise typer.Exit(result.exit_code)
+
+
+def _show_reading(progress: Progress, began_s: float, done: int, total: int) -> None:
+    """Show how many scenes are read, where that takes longer than a moment."""
+    if time.monotonic() - began_s > MOMENT_S:
+        progress.show("reading scenes", done, total)
 
 
 def _drive(

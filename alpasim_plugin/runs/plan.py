@@ -5,7 +5,7 @@ keys.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -180,9 +180,16 @@ def make_plan(
     policies: Sequence[str],
     seeds: Sequence[int],
     options: RunOptions,
+    report: Callable[[int, int], None] | None = None,
 ) -> RunPlan:
     """Load every scenario, resolve every part, and list the rollouts, scene by scene so that workers
     reuse a loaded scene.
+
+    Args:
+        refs: The scenarios.
+        renderers, policies, seeds: Their names, and the seeds.
+        options: Of the run.
+        report: Called with scenarios read, and all of them.
 
     Raises:
         InputError: A scenario or a part is invalid, two scenarios share an id, or a name is given
@@ -203,7 +210,7 @@ def make_plan(
     scenarios = {}
     sources: dict[str | None, str | None] = {}  # source of a recorded log -> digest of its code
     cells = []
-    for ref, scenario in _load(refs):
+    for ref, scenario in _load(refs, report):
         scenarios[scenario.scene_id] = scenario
         if scenario.source_part not in sources:
             sources[scenario.source_part] = code_digest_of(scenario)
@@ -310,10 +317,15 @@ def _check_fixer_settings(
         )
 
 
-def _load(refs: Sequence[ScenarioRef]) -> list[tuple[ScenarioRef, Scenario]]:
+def _load(
+    refs: Sequence[ScenarioRef], report: Callable[[int, int], None] | None
+) -> list[tuple[ScenarioRef, Scenario]]:
     """Load scenarios with the files that they show, and a note where the background is not as stated."""
     loaded: dict[str, tuple[ScenarioRef, Scenario]] = {}
-    for ref in dict.fromkeys(refs):  # what two suites list is driven once
+    distinct = list(dict.fromkeys(refs))  # what two suites list is driven once
+    for number, ref in enumerate(distinct):
+        if report is not None:
+            report(number, len(distinct))
         scenario = load_scenario(ref.path, ref.seed, ref.overrides, ref.source)
         if scenario.scene_id in loaded:
             raise InputError(

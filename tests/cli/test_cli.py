@@ -263,3 +263,14 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
 def test_other_seeds_are_refused(text):
     with pytest.raises(InputError):
         parse_seeds(text)
+
+
+def test_reading_scenes_is_shown_where_it_takes_longer_than_a_moment(monkeypatch, capsys):
+    command = [*GOOD, "--dry-run", "smoke/straight", "smoke/curve"]
+    assert run_command(command) == 0
+    assert "reading scenes" not in capsys.readouterr().err
+    monkeypatch.setattr("alpasim_plugin.cli.run.MOMENT_S", -1.0)
+    assert run_command(command) == 0
+    assert "reading scenes 0/2" in capsys.readouterr().err
+    assert run_command([*command, "--json"]) == 0
+    assert capsys.readouterr().err == ""
