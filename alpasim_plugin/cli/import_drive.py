@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,10 +43,26 @@ def drive(
         ),
     ] = None,
     device: Annotated[str, Flag("Where to fit: cpu, cuda or cuda:N.")] = "cpu",
+    steps: Annotated[
+        int | None,
+        Flag(
+            "Updates of the fit; default: 1300. Fewer are sooner there and less like the photographs.",
+            min=20,
+            max=100_000,
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a scenario of a recorded drive: photographs with poses."""
-    _import(lambda tell: import_drive(folder, out, camera_height, road, tell, device), out, as_json)
+    """Make a scenario of a recorded drive: photographs with poses.
+
+    After a quarter of the updates a scenario of the street as it is then is written to OUT.preview,
+    with images, to be driven while the fit goes on.
+    """
+    _import(
+        lambda tell: import_drive(folder, out, camera_height, road, tell, device, steps),
+        out,
+        as_json,
+    )
 
 
 def splat(
@@ -72,7 +89,7 @@ def _import(work: Callable[[Report], dict[str, Any]], out: Path, as_json: bool) 
     began = time.perf_counter()
     try:
         with Progress(as_json) as progress:
-            quality = work(progress.show)
+            quality = work(partial(_tell, progress))
     except Stopped as stop:
         stop.kept = "the same command goes on where it stopped"
         raise
@@ -87,6 +104,14 @@ def _import(work: Callable[[Report], dict[str, Any]], out: Path, as_json: bool) 
             )
     lines += [f"page     {out / 'quality.md'}", f"next     simrun --renderer 3dgs {scenario}"]
     show(as_json, facts, *lines)
+
+
+def _tell(progress: Progress, stage: str, done: int, all: int) -> None:
+    """Show how much of a stage is done, or print a sentence, of which there is no more to do."""
+    if all:
+        progress.show(stage, done, all)
+    else:
+        progress.say(stage)
 
 
 app = typer_of(

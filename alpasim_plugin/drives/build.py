@@ -33,13 +33,15 @@ from alpasim_plugin.drives.placing import (
     place,
 )
 from alpasim_plugin.drives.points import road_points, triangulated, with_corrected_poses
-from alpasim_plugin.drives.quality import measure, require_covered, write_page
+from alpasim_plugin.drives.quality import IMAGES, measure, require_covered, write_page
 from alpasim_plugin.drives.source import Points, SourceDrive, checked
 from alpasim_plugin.gaussians.files.ply import write_points
-from alpasim_plugin.gaussians.fit.drive import fit_drive
+from alpasim_plugin.gaussians.fit.drive import FITTING, FittedDrive, fit_drive
 from alpasim_plugin.gaussians.fit.photographs import PosedPhotograph, resized
+from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import cloud_from_points
+from alpasim_plugin.gaussians.fit.trial import Trial
 from alpasim_plugin.gaussians.fit.views import PosedView
 from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.scene.log_views import actors_at
@@ -65,7 +67,9 @@ THIN_MODEL_HINT = (
     "Check that the poses belong to the photographs, and give photographs that overlap and show the "
     "road: a policy would drive through nothing."
 )
-Report = Callable[[str, int, int], None]  # stage, how much is done, how much there is
+PREVIEW_NOTE = "a preview: its fit had done a quarter of the updates"
+# Stage, how much is done, how much there is; of 0 the stage is a sentence for the user.
+Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +114,12 @@ def import_drive(
     lane_map: Path | None = None,
     report: Report | None = None,
     device: str = "cpu",
+    steps: int | None = None,
 ) -> JsonObject:
     """Make a scenario of a recorded drive.
+
+    After a quarter of the updates of its fit, a scenario of the street as it is then is written
+    beside ``out``: `preview_folder`. It can be driven while the fit goes on.
 
     Args:
         folder: The recording.
@@ -123,6 +131,7 @@ def import_drive(
             path.
         report: Called as the work goes on.
         device: Where to fit.
+        steps: Updates of the fit; None takes those of `SplatRecipe.street`.
 
     Returns:
         What ``quality.json`` holds.
@@ -135,19 +144,52 @@ def import_drive(
     require_device(device)
     tell = report or (lambda stage, done, all: None)
     with working_folder(out) as work:
-        drive, key = read_inputs(folder, camera_height_m, lane_map, device)
+        drive, key = read_inputs(folder, camera_height_m, lane_map, device, steps)
         if os.path.exists(out):
             return finished(out, key)
-        tell(_expected(len(drive.photographs)), 0, 1)
-        return _built(drive, folder, work, key, camera_height_m, lane_map, tell, device)
+        recipe = SplatRecipe.street()
+        recipe = recipe if steps is None else replace(recipe, steps=steps)
+        tell(
+            f"{len(drive.photographs)} photographs; how long their fit takes is said before it begins",
+            0,
+            0,
+        )
+        task = _Import(drive, folder, out, work, key, camera_height_m, lane_map, recipe, device)
+        return _built(task, tell)
 
 
-def _expected(count: int) -> str:
-    """Say before the work begins what an import takes, by one that was measured (docs/costs.md)."""
+@dataclass(frozen=True)
+class _Import:
+    """What is imported, and where to."""
+
+    drive: SourceDrive
+    folder: Path
+    out: Path
+    work: Path
+    key: str
+    camera_height_m: float | None
+    map_file: Path | None
+    recipe: SplatRecipe
+    device: str
+
+
+def preview_folder(out: Path) -> Path:
+    """Return where an import writes what it has after a quarter of the fit."""
+    return out.with_name(f"{out.name}.preview")
+
+
+def _expected(trial: Trial, device: str) -> str:
+    """Say before a fit begins how long it takes, by a trial on this machine."""
+    steps = trial.recipe.steps
+    minutes = trial.seconds_until(steps) / 60
     return (
-        f"reading {count} photographs (a street of 40 with 256x144 pixels took 3.6 minutes of processor time; "
-        "how long this one takes is said after 20 updates of its fit)"
+        f"the fit: {steps} updates, about {_minutes(minutes)} in all on this machine ({device}), as busy as it is now; "
+        "more where many Gaussians are added"
     )
+
+
+def _minutes(minutes: float) -> str:
+    return f"{minutes:.0f} minutes" if minutes >= 1.5 else f"{max(60 * minutes, 1):.0f} seconds"
 
 
 @contextmanager
@@ -167,23 +209,16 @@ def working_folder(out: Path) -> Iterator[Path]:
         work.replace(out)
 
 
-def _built(
-    drive: SourceDrive,
-    folder: Path,
-    work: Path,
-    key: str,
-    camera_height_m: float | None,
-    map_file: Path | None,
-    tell: Report,
-    device: str,
-) -> JsonObject:
+def _built(task: _Import, tell: Report) -> JsonObject:
     """Place, fit and measure a drive, and write all of it into a working folder."""
+    work = task.work
+    map_file = task.map_file
 
     def placed_by(stride: int) -> tuple[SourceDrive, PlacedDrive]:
         tell("correcting poses", 0, 1)
-        moved = with_corrected_poses(drive, stride)
-        points = _points(fitted_part(moved, stride), folder, tell)
-        return moved, place(moved, points, camera_height_m)
+        moved = with_corrected_poses(task.drive, stride)
+        points = _points(fitted_part(moved, stride), task.folder, tell)
+        return moved, place(moved, points, task.camera_height_m)
 
     drive, placed, stride = measured(placed_by)
     check_motion(drive, placed)
@@ -194,10 +229,10 @@ def _built(
     )
     drive = replace(drive, notes=(*drive.notes, *notes))
     photographs = placed_photographs(drive, placed, stride)
-    through_lens = implementation(device, True, False)
+    through_lens = implementation(task.device, True, False)
     if not through_lens and any(photograph.source.lens.bends for photograph in photographs):
         drive = replace(drive, notes=(*drive.notes, STRAIGHT_ON_GPU))
-    begin(work, key)
+    begin(work, task.key)
     write_photographs(work, photographs, tell)
     actors = placed.actors
     views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
@@ -205,6 +240,22 @@ def _built(
         present = actors_at(actors, int(photograph.source.t_us or 0))
         views[photograph.use].append(replace(photograph.view(through_lens), actors=present))
     visible_ids = {name for view in views["fitted"] for name in _in_view(view)}
+
+    def preview(street: FittedDrive) -> None:
+        noted = replace(drive, notes=(*drive.notes, PREVIEW_NOTE))
+        _write_preview(task, noted, placed, roads, street, photographs, views, tell)
+
+    trials: list[Trial] = []
+
+    def tried(trial: Trial) -> None:
+        trials.append(trial)
+        tell(_expected(trial, task.device), 0, 0)
+
+    def told(stage: str, done: int, all: int, numbers: Mapping[str, float]) -> None:
+        # The second half of the updates takes longer; what is shown goes with the time.
+        share = trials[-1].share_of(done) if stage == FITTING and trials else done / max(all, 1)
+        tell(stage, round(all * share), all)
+
     near = placed.points.chosen(placed.points.spread < np.percentile(placed.points.spread, 90))
     done = fit_drive(
         views["fitted"],
@@ -214,16 +265,71 @@ def _built(
         scene_id=scene_id_of(drive),
         folder=work / FIT_FOLDER,
         seed=SEED,
-        report=lambda stage, step, steps, numbers: tell(stage, step, steps),
-        device=device,
+        report=told,
+        preview=preview,
+        trial=tried,
+        recipe=task.recipe,
+        device=task.device,
     )
     quality = write_folder(
         work, drive, placed, roads, done.model, photographs, views, done.exposures, tell
     )
     on_path = next(row for row in quality["coverage"] if row["lateral_m"] == 0.0)
-    require_covered(folder, on_path["share"], THIN_MODEL_HINT)
+    require_covered(task.folder, on_path["share"], THIN_MODEL_HINT)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
+
+
+def _write_preview(
+    task: _Import,
+    drive: SourceDrive,
+    placed: PlacedDrive,
+    roads: LaneMap,
+    street: FittedDrive,
+    photographs: Sequence[PlacedPhotograph],
+    views: Mapping[str, Sequence[PosedView]],
+    tell: Report,
+) -> None:
+    """Write a scenario of a street that is being fitted, and name it and an image of it. One of an
+    earlier import is replaced; anything else in its place stays.
+    """
+    target = preview_folder(task.out)
+    if os.path.exists(target):
+        if not os.path.isfile(target / KEY_FILE):
+            tell(f"no preview is written: {target} is there", 0, 0)
+            return
+        shutil.rmtree(target)
+    tell("writing a preview", 0, 1)
+    with working_folder(target) as folder:
+        begin(folder, f"preview of {task.key}")
+        for photograph in photographs:
+            _link(task.work / photograph.file, folder / photograph.file)
+        write_folder(
+            folder,
+            drive,
+            placed,
+            roads,
+            street.model,
+            photographs,
+            views,
+            street.exposures,
+            lambda stage, done, all: None,
+        )
+    images = sorted((target / IMAGES).glob("*.jpg"))
+    look = f"look at {images[0]} (photograph above, street below), " if images else ""
+    drive_it = f"drive it with: simrun --renderer 3dgs {target / SCENARIO_FILE}"
+    tell(f"a quarter of the updates is done: {look}{drive_it}", 0, 0)
+
+
+def _link(file: Path, other: Path) -> None:
+    """Let a file have a second name, or copy it where the disk has no such names."""
+    other.parent.mkdir(parents=True, exist_ok=True)
+    if os.path.exists(other):
+        return
+    try:
+        os.link(file, other)
+    except OSError:
+        shutil.copyfile(file, other)
 
 
 def write_folder(
@@ -294,7 +400,11 @@ def _scenario_text(drive: SourceDrive, scene_id: str, length_us: int) -> str:
 
 
 def read_inputs(
-    folder: Path, camera_height_m: float | None, lane_map: Path | None, device: str
+    folder: Path,
+    camera_height_m: float | None,
+    lane_map: Path | None,
+    device: str,
+    steps: int | None = None,
 ) -> tuple[SourceDrive, str]:
     """Return the drive that an import reads, and the key of the import: everything that was read,
     and the options.
@@ -305,6 +415,8 @@ def read_inputs(
         inputs.setting("camera height", camera_height_m)
         inputs.setting("map", None if lane_map is None else content_of(lane_map))
         inputs.setting("device", device.partition(":")[0])
+        if steps is not None:
+            inputs.setting("steps", steps)
     return drive, inputs.key
 
 

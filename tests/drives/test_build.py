@@ -5,6 +5,7 @@ is left half-written.
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -97,6 +98,48 @@ def test_an_import_that_is_stopped_goes_on_and_leaves_no_scenario(tmp_path, monk
     assert load_scenario(tmp_path / "out/scenario.yaml").model
 
 
+def test_a_street_can_be_looked_at_and_driven_while_it_is_fitted(imported):
+    said = [tuple(told) for told in json.loads((imported.parent / "said.json").read_text())]
+    preview = build.preview_folder(imported)
+    assert load_scenario(preview / "scenario.yaml").model == str(preview / "model")
+    assert any("1300 updates, about 5 minutes in all on this machine" in text for text, *_ in said)
+    assert ("fitting", 260, 1300) in said, "half of the updates take a fifth of the time"
+    (sentence,) = [text for text, _, all in said if all == 0 and "a quarter of the updates" in text]
+    image = Path(sentence.split("look at ")[1].split(" (")[0])
+    assert image.is_file()
+    assert image.is_relative_to(preview)
+    assert str(preview / "scenario.yaml") in sentence
+    assert "a preview" in (preview / "quality.md").read_text()
+    assert "a preview" not in (imported / "quality.md").read_text()
+
+
+def test_a_number_of_updates_is_that_of_the_fit_and_makes_another_import(
+    imported, tmp_path, monkeypatch
+):
+    source = imported.parent / "street"
+    with pytest.raises(InputError, match="with other options"):
+        import_drive(source, imported, steps=400)
+    tasks = []
+
+    def stop(task, tell):
+        tasks.append(task)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build, "_built", stop)
+    with pytest.raises(KeyboardInterrupt):
+        import_drive(source, tmp_path / "out", steps=400)
+    assert tasks[0].recipe.steps == 400
+
+
+def test_a_folder_in_the_place_of_a_preview_stays(tmp_path):
+    mine = build.preview_folder(tmp_path / "out")
+    mine.mkdir()
+    said = []
+    task = SimpleNamespace(out=tmp_path / "out")
+    build._write_preview(task, *[None] * 6, lambda *told: said.append(told))
+    assert said == [(f"no preview is written: {mine} is there", 0, 0)]
+
+
 @pytest.mark.slow
 def test_scale_without_metres_comes_from_the_cameras_height(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk")
@@ -111,7 +154,7 @@ def test_scale_without_metres_comes_from_the_cameras_height(tmp_path, quick_fit)
         camera_height_m=1.5,
         report=lambda stage, done, all: stages.append(stage),
     )
-    assert "took 3.6 minutes of processor time" in stages[0], "before anything is done"
+    assert "photographs; how long their fit takes" in stages[0], "before anything is done"
     assert quality["scale"] == "scale from the camera's height above the ground, 1.5 m (as given)"
     ego = load_scenario(tmp_path / "out/scenario.yaml").ego_log.xyz
     assert np.linalg.norm(ego[-1] - ego[0]) == pytest.approx((COUNT - 1) * STEP_M, rel=0.03)

@@ -21,14 +21,17 @@ from alpasim_plugin.gaussians.fit.lens import (
     through_lens,
     without_distortion,
 )
-from alpasim_plugin.gaussians.fit.loop import fit
+from alpasim_plugin.gaussians.fit.loop import Look, fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
 from alpasim_plugin.gaussians.fit.reconstruction import Reconstruction
 from alpasim_plugin.gaussians.fit.start import Start, start_from_maps, start_in_boxes
 from alpasim_plugin.gaussians.fit.tracks import Tracks, follow, place
+from alpasim_plugin.gaussians.fit.trial import Trial, trial_of
 from alpasim_plugin.gaussians.fit.views import PosedView, camera_of
 from alpasim_plugin.gaussians.lens_camera import LensCamera
 
+FITTING = "fitting"  # the stage
+PREVIEW_SHARE = 0.25  # of the updates, after which a street can be looked at
 LEAST_WAY_M = 10.0  # a camera that moves less is not driven along a street under a sky
 LEAST_MEASURED = 0.02  # share of the measured pixels that must have a depth for a start from them
 # Stage, done, all, numbers of the fit
@@ -60,6 +63,8 @@ def fit_drive(
     folder: Path | None = None,
     seed: int = 0,
     report: Report | None = None,
+    preview: Callable[[FittedDrive], None] | None = None,
+    trial: Callable[[Trial], None] | None = None,
     threads: int | None = None,
     recipe: SplatRecipe | None = None,
     device: str = "cpu",
@@ -79,6 +84,8 @@ def fit_drive(
         seed: Of the start, the order of views and the splits.
         report: Called with stage, done and all; while fitting also with loss, psnr_db and
             gaussians.
+        preview: Given the street as it is after `PREVIEW_SHARE` of the updates.
+        trial: Given what some updates take before the fit begins. None makes no trial.
         threads: Of the rasteriser.
         recipe: How to fit; None is `SplatRecipe.street`.
         device: Where to fit; what comes before is measured on the CPU.
@@ -97,15 +104,24 @@ def fit_drive(
         _start(train, guesses, points, recipe, scene_id),
         start_in_boxes(_boxes_in_view(train, boxes or {}), recipe.actor_points, scene_id, seed),
     )
+
+    if trial is not None:
+        trial(trial_of(train, start, recipe, threads=threads, device=device))
+
+    def show(model: Reconstruction) -> None:
+        if preview is not None:
+            preview(FittedDrive(model, _exposures(train, model, kept or {})))
+
     model = fit(
         train,
         start,
         recipe,
+        look=Look(max(1, round(PREVIEW_SHARE * recipe.steps)), show),
         scene_id=scene_id,
         folder=folder,
         threads=threads,
         device=device,
-        report=lambda step, numbers: tell("fitting", step, recipe.steps, numbers),
+        report=lambda step, numbers: tell(FITTING, step, recipe.steps, numbers),
     )
     return FittedDrive(model, _exposures(train, model, kept or {}))
 

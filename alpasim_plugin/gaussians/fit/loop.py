@@ -45,9 +45,23 @@ from alpasim_plugin.gaussians.raster.rasterize_triton import compositor_of
 from alpasim_plugin.gaussians.scene.sky import HEIGHT, WIDTH, Sky
 
 Report = Callable[[int, Mapping[str, float]], None]  # (updates made, numbers of the last one)
+
 DEPTH_CLIP = 0.5  # of a share: a measured depth may be wrong altogether
 STATE_FILE = "state.safetensors"
 SMALLEST_EXTENT_M = 5.0  # of a drive that hardly moves
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look at a model while it is fitted.
+
+    Attributes:
+        step: After so many updates.
+        show: Given the model.
+    """
+
+    step: int
+    show: Callable[[Reconstruction], None]
 
 
 def fit(
@@ -58,6 +72,7 @@ def fit(
     scene_id: str = "",
     folder: Path | None = None,
     report: Report | None = None,
+    look: Look | None = None,
     threads: int | None = None,
     device: str = "cpu",
 ) -> Reconstruction:
@@ -74,6 +89,8 @@ def fit(
             the same bits. None keeps none.
         report: Called after every update with loss, psnr_db (of the training view just seen) and
             gaussians.
+        look: Given the model as it is after a number of updates; a fit that goes on behind it does
+            not come by there.
         threads: Of the CPU rasteriser; None leaves it as it is.
         device: Where to fit; a folder begun on one may go on on another. The host waits for a GPU
             once an update.
@@ -93,16 +110,12 @@ def fit(
             numbers = run.update()
             if report is not None:
                 report(run.step, numbers)
+            if look is not None and run.step == look.step:
+                look.show(run.reconstruction())
             is_due = run.step % recipe.save_every == 0 or run.step == recipe.steps
             if folder is not None and is_due:
                 run.save()
-    background, actors = run.model.clouds()
-    gains = tuple(
-        (float(red), float(green), float(blue)) for red, green, blue in run.exposure.gains()
-    )
-    return Reconstruction(
-        background, actors, run.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32)), gains
-    )
+        return run.reconstruction()
 
 
 @contextmanager
@@ -204,6 +217,15 @@ class SplatFit:
             self.gradients = ScreenGradients(len(self.model), self.device)
         psnr = min(CAP_DB, decibels(max(numbers["mse"], 1e-30), peak=1.0))
         return {"loss": numbers["loss"], "psnr_db": psnr, "gaussians": len(self.model)}
+
+    def reconstruction(self) -> Reconstruction:
+        """Return the model as it is now."""
+        background, actors = self.model.clouds()
+        gains = tuple(
+            (float(red), float(green), float(blue)) for red, green, blue in self.exposure.gains()
+        )
+        sky = self.sky or Sky(np.zeros((HEIGHT, WIDTH, 3), dtype=np.float32))
+        return Reconstruction(background, actors, sky, gains)
 
     def _differentiate(self, target: _Target) -> dict[str, float]:
         """Give the parameters the gradients of a view's loss, and add up how strongly the view pulls at

@@ -10,8 +10,9 @@ import pytest
 from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.gaussians.fit import loop
-from alpasim_plugin.gaussians.fit.loop import STATE_FILE, fit
+from alpasim_plugin.gaussians.fit.loop import STATE_FILE, Look, fit
 from alpasim_plugin.gaussians.fit.recipe import SplatRecipe
+from alpasim_plugin.gaussians.fit.trial import Trial, trial_of
 from tests.gaussians.fit.conftest import BOX, actor_pose, at, camera_at
 
 QUICK = SplatRecipe(steps=40, points=300, cap=420, densify_every=10, save_every=15, sh_degree=1)
@@ -48,6 +49,25 @@ def test_views_held_out_are_shown_better_after_the_fit_than_by_the_start(posed):
     assert [row["step"] for row in numbers] == list(range(1, 81))
     assert numbers[-1]["loss"] < 0.5 * numbers[0]["loss"]
     assert len(posed.start.background) < len(after) <= recipe.cap
+
+
+def test_a_look_at_a_fit_shows_the_model_of_that_step_and_changes_nothing(posed):
+    seen = []
+    looked_at = fit(posed.views, posed.start, QUICK, look=Look(10, seen.append))
+    assert bits(looked_at) == bits(fit(posed.views, posed.start, QUICK))
+    (early,) = seen
+    assert mean_psnr(early, posed.views) < mean_psnr(looked_at, posed.views)
+
+
+def test_a_trial_times_updates_of_both_sizes(posed):
+    seconds = iter([0.0, 3.0, 10.0, 22.0])  # three coarse updates, three whole ones
+    recipe = replace(QUICK, steps=100, coarse_share=0.25)
+    trial = trial_of(posed.views, posed.start, recipe, clock=lambda: next(seconds))
+    assert (trial.coarse_s, trial.whole_s) == (1.0, 4.0)
+    assert trial.seconds_until(100) == 25 * 1.0 + 75 * 4.0
+    assert [trial.share_of(step) for step in (0, 100)] == [0.0, 1.0]
+    whole = Trial(replace(recipe, coarse_share=0.0), 0.0, 2.0)
+    assert whole.share_of(25) == 0.25
 
 
 def test_a_fit_cut_off_and_continued_ends_with_the_same_bits(posed, tmp_path):
