@@ -48,7 +48,7 @@ from alpasim_plugin.log.run_folder.records import json_of
 from alpasim_plugin.runs.provenance import hardware, part_facts, versions
 
 RAW = "3dgs"  # the variant of the unfixed render
-VERSION = 8  # of what a row holds and how it is measured; part of its key
+VERSION = 9  # of what a row holds and how it is measured; part of its key
 CAMERA = "camera"
 DIGITS = 7  # significant, of stored values
 PICTURE_SHARES = (0.1, 0.5, 0.97)  # frames on the sheets, as shares of a clip

@@ -13,7 +13,7 @@ import numpy as np
 
 from alpasim_plugin.core.types import F64, I64, U8, Bool
 from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS
-from alpasim_plugin.lab.video_metrics.road import is_marking
+from alpasim_plugin.lab.video_metrics.road import faces_of_boxes, is_marking
 
 FOCAL_PX = 1266.42  # of the front camera that the published detector was trained with
 SCORE = 0.10
@@ -119,7 +119,8 @@ def drawn_vehicles(sdmap: U8, size: tuple[int, int]) -> Bool:
         small = OFF / np.linalg.norm(colours[0])  # rounding may make a zero share slightly negative
         off = np.linalg.norm(pixels - shares @ colours, axis=-1)
         mask |= (shares >= -small).all(axis=-1) & (off <= OFF + OFF_SHARE * length) & (length > 0)
-    mask &= ~is_marking(sdmap)  # untyped lane lines have nearly the colour of a car
+    # Untyped lane lines have nearly the colour of a car, and are as narrow as no near one
+    mask &= faces_of_boxes(sdmap) | ~is_marking(sdmap)
     height, width = size
     scaled = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(scaled, dtype=bool)

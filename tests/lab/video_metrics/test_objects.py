@@ -76,6 +76,15 @@ def test_drawn_vehicles_are_cars_and_trucks_and_no_paint():
     assert mask[::2, ::2].sum(axis=1).tolist() == [3, 2, 0, 0]
 
 
+def test_a_near_car_in_the_colour_of_an_untyped_line_is_a_vehicle_and_the_line_is_none():
+    sdmap = np.zeros((40, 256, 3), dtype=np.uint8)
+    sdmap[10:30, 50:80] = (101, 174, 231)  # between its front and its back colour
+    sdmap[:, 120:122] = COLOURS["line_untyped"]
+    mask = drawn_vehicles(sdmap, (40, 256))
+    assert mask[10:30, 50:80].all()
+    assert not mask[:, 90:].any()
+
+
 def lanes(*offsets, end=80.0, scores=None, far=None):
     """Return straight lanes at lateral offsets; from ``far`` metres on the first lies 3 m aside."""
     ahead = np.linspace(3.0, end, 78)

@@ -89,6 +89,49 @@ def test_road_lies_between_the_outermost_markings_however_faded():
     assert not road_mask(np.zeros_like(sdmap)).any()
 
 
+def test_the_road_goes_on_to_the_side_that_its_edge_has_left_through():
+    sdmap = np.zeros((1, 40, 64, 3), dtype=np.uint8)
+    rows = np.arange(5, 40)
+    left = 30 - 2 * (rows - 5)  # leaves the image at row 20
+    right = 34 + (rows - 5)  # leaves it at row 34
+    for row, a, b in zip(rows, left, right, strict=True):
+        for column in (a, b):
+            if 0 <= column < 64:
+                sdmap[0, row, column] = COLOURS["road_boundary"]
+    road = road_mask(sdmap)[0]
+    assert np.flatnonzero(road[15]).tolist() == list(range(10, 45))
+    assert np.flatnonzero(road[25]).tolist() == list(range(55))  # from the side to the right edge
+    assert road[36].all()  # neither edge is in sight, the camera stands on the road
+    assert not road[4].any()
+
+
+def test_an_edge_that_mixes_with_a_white_line_is_an_edge():
+    sdmap = np.zeros((1, 12, 64, 3), dtype=np.uint8)
+    sdmap[0, 4, :2] = (235, 119, 225)
+    sdmap[0, 8, 20] = COLOURS["line_white"]
+    sdmap[0, 8, 40] = COLOURS["road_boundary"]
+    assert np.flatnonzero(road_mask(sdmap)[0, 8]).tolist() == list(range(41))
+
+
+def test_a_light_blue_car_is_no_road_though_untyped_lines_look_like_it():
+    sdmap = np.zeros((1, 30, 256, 3), dtype=np.uint8)
+    sdmap[0, 20, 10:60:49] = COLOURS["line_untyped"]
+    sdmap[0, 5:25, 100:150] = (101, 174, 231)  # between its front and its back colour
+    road = road_mask(sdmap)[0]
+    assert np.flatnonzero(road[20]).tolist() == list(range(10, 60))
+    assert not road[10].any()
+
+
+def test_another_edge_in_the_same_half_ends_the_road_again():
+    sdmap = np.zeros((1, 20, 64, 3), dtype=np.uint8)
+    sdmap[0, 5, 0:20] = COLOURS["road_boundary"]  # the far side of a side street
+    sdmap[0, 10, 40] = COLOURS["road_boundary"]
+    sdmap[0, 15, 16:41:24] = COLOURS["road_boundary"]
+    road = road_mask(sdmap)[0]
+    assert road[10, :41].all()
+    assert np.flatnonzero(road[15]).tolist() == list(range(16, 41))
+
+
 def test_a_road_user_is_no_road_and_its_grey_edges_are_no_paint():
     sdmap = np.zeros((1, 20, 128, 3), dtype=np.uint8)
     sdmap[0, 10, 10:60:49] = COLOURS["road_boundary"]
