@@ -9,8 +9,9 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import cv2
@@ -26,6 +27,7 @@ from alpasim_plugin.core.types import F64, I64, U8, Frame
 from alpasim_plugin.fixers.refine import StreamStats, refine_frames
 from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.lab.jobs import map_jobs
+from alpasim_plugin.lab.training.lane_lines import has_lanes, read_lanes
 from alpasim_plugin.lab.training.lost_resolution import draw_lost_resolution
 from alpasim_plugin.lab.training.pair_store import CONTENT, PairSequence
 from alpasim_plugin.lab.training.reference_store import SequenceReferences, open_references
@@ -37,7 +39,12 @@ from alpasim_plugin.lab.video_metrics.image_distance import (
     digests,
     load_distance,
 )
-from alpasim_plugin.lab.video_metrics.objects import object_metrics
+from alpasim_plugin.lab.video_metrics.objects import (
+    Objects,
+    clean_metrics,
+    detect_objects,
+    object_metrics,
+)
 from alpasim_plugin.lab.video_metrics.road import road_mask
 from alpasim_plugin.lab.video_metrics.sheet import sheet
 from alpasim_plugin.lab.video_metrics.summary import TRUTH, summarise
@@ -70,6 +77,7 @@ class QualityClip:
     sdmap: U8  # (T, H, W, 3)
     t_us: I64  # (T,)
     recorded: SequenceReferences | None = None
+    lanes: Sequence[F64] | None = None  # of every frame (L, 29), metres
 
     @property
     def scene(self) -> str:
@@ -79,7 +87,9 @@ class QualityClip:
     def first(self, frames: int) -> QualityClip:
         """Return the clip's first frames, all of them where it has fewer."""
         names = ("render", "truth", "opacity", "sdmap", "t_us")
-        return replace(self, **{name: getattr(self, name)[:frames] for name in names})
+        lanes = None if self.lanes is None else self.lanes[:frames]
+        cut = {name: getattr(self, name)[:frames] for name in names}
+        return replace(self, **cut, lanes=lanes)
 
     def references(self, count: int, past: bool = False) -> Iterator[tuple[U8, ...]]:
         """Yield the references of every frame, at most ``count`` each."""
@@ -105,8 +115,17 @@ def quality_clip(sequence: PairSequence, input_kind: InputKind = "render") -> Qu
     if input_kind == "lost-resolution":
         render, opacity = lose_resolution(clip.rgb_gt, sequence.name)
     recorded = open_references(sequence)
+    lanes = read_lanes(sequence.folder) if has_lanes(sequence.folder) else None
     return QualityClip(
-        sequence.name, identity, render, clip.rgb_gt, opacity, clip.sdmap, clip.t_us, recorded
+        sequence.name,
+        identity,
+        render,
+        clip.rgb_gt,
+        opacity,
+        clip.sdmap,
+        clip.t_us,
+        recorded,
+        lanes,
     )
 
 
@@ -189,16 +208,14 @@ def measure(
     seed: int,
     networks: Mapping[str, ImageDistance],
     weights: Path | None = None,
+    objects: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the row of one clip under one variant (`alpasim_plugin.lab.video_metrics.summary`);
-    ``weights`` is the folder of I3D and of detectors.
+    ``weights`` is the folder of I3D, ``objects`` are the values by detectors.
     """
     truth = None if variant.label == TRUTH else clip.truth
     quality = clip_quality(result.video, truth, networks, road_mask(clip.sdmap))
-    values = quality.means
-    if truth is not None and weights is not None and available_detectors(weights):
-        K = intrinsics_of(clip.identity.get("camera"), clip.name)
-        values |= object_metrics(result.video, truth, clip.sdmap, K, weights)
+    values = {**quality.means, **objects}
     later_blocks = result.ms_per_frame[1:] or result.ms_per_frame  # the first one is shorter
     return {
         "arm": variant.label,
@@ -238,6 +255,7 @@ class Work:
         out: Folder of rows and images.
         pictured: Whether some frames are kept for a sheet.
         truth_rows: Folder of the rows of the truth; None: that of the others.
+        detectors: Folder of detectors; None: there are none.
     """
 
     folder: Path
@@ -251,6 +269,7 @@ class Work:
     out: Path
     pictured: bool
     truth_rows: Path | None = None
+    detectors: Path | None = None
 
     @property
     def row_file(self) -> Path:
@@ -280,14 +299,17 @@ def row_key(clip: QualityClip, work: Work) -> str:
         work.variant.spec and work.variant.spec.digest,
         work.seed,
         work.device,
-        metric_digests(work.weights),
+        metric_digests(work.weights, work.detectors),
+        clip.lanes is not None,
     ]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def metric_digests(folder: Path | None) -> dict[str, str]:
-    """Return the metrics that there are weights for, each with the digest of what calibrates it."""
-    return digests(folder) | available_i3d(folder) | available_detectors(folder)
+def metric_digests(folder: Path | None, detectors: Path | None) -> dict[str, str]:
+    """Return the metrics that there are weights or a detector for, each with the digest of what
+    calibrates it.
+    """
+    return digests(folder) | available_i3d(folder) | available_detectors(detectors)
 
 
 def finish(work: Work) -> dict[str, Any]:
@@ -315,9 +337,33 @@ def finish(work: Work) -> dict[str, Any]:
     for i in frame_numbers:
         _write_png(work.picture_file(i), result.video[i])
     distances = {name: _network(name, work.weights) for name in available(work.weights)}
-    row = measure(clip, work.variant, result, work.seed, distances, work.weights)
+    objects = object_values(clip, work, result.video)
+    row = measure(clip, work.variant, result, work.seed, distances, work.weights, objects)
     write_json(work.row_file, {"key": key, "row": row})
     return row
+
+
+def object_values(clip: QualityClip, work: Work, video: U8) -> dict[str, float]:
+    """Return what detectors say of a variant's video of a clip, by the name of the metric: of the truth
+    their precision and recall, of others these and how far they agree with the truth.
+    """
+    if work.detectors is None or not available_detectors(work.detectors):
+        return {}
+    K = intrinsics_of(clip.identity.get("camera"), clip.name)
+    true = _true_objects(work.folder, str(clip.identity[CONTENT]), len(clip.t_us), work.detectors)
+    values = clean_metrics(true, clip.sdmap, clip.lanes)
+    if work.variant.label != TRUTH:
+        values |= object_metrics(detect_objects(video, K, work.detectors), true)
+    return values
+
+
+@lru_cache(256)
+def _true_objects(folder: Path, content: str, frames: int, detectors: Path) -> Objects:
+    """Return what detectors find in the clean frames of a sequence, which every variant needs."""
+    sequence = PairSequence(folder)
+    assert sequence.content == content
+    K = intrinsics_of(sequence.info.get("camera"), sequence.name)
+    return detect_objects(sequence.clip.rgb_gt[:frames], K, detectors)
 
 
 def measure_quality(
@@ -355,7 +401,7 @@ def measure_quality(
             for label, spec in variants.items()
         },
         "units": {label: unit_of(spec) for label, spec in variants.items()},
-        "networks": metric_digests(first.weights),
+        "networks": metric_digests(first.weights, first.detectors),
         "load": os.getloadavg()[0],
         "hardware": hardware(),
         "versions": versions(),

@@ -75,6 +75,13 @@ Weights = Annotated[
         "--metric-weights", help=f"Folder of the metrics' weights; also {FOLDER_VARIABLE}."
     ),
 ]
+Detectors = Annotated[
+    Path | None,
+    typer.Option(
+        "--detectors",
+        help="Folder of cuboid_detector and lane_detector, as 'simrun train detector' writes; by default --metric-weights.",
+    ),
+]
 Pictures = Annotated[
     int, typer.Option("--pictures", min=0, help="Clips that are shown side by side.")
 ]
@@ -111,6 +118,7 @@ def quality(
     clips: Clips = None,
     overrides: Overrides = None,
     weights: Weights = None,
+    detectors: Detectors = None,
     pictures: Pictures = 4,
     truth_rows: TruthRows = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the fixers' noise.")] = 0,
@@ -146,6 +154,7 @@ def quality(
             out,
             sequence.name in pictured_names,
             truth_rows,
+            detectors or weights_folder(weights),
         )
         for sequence in sequences
         for variant in (*variants, Variant(TRUTH))

@@ -6,6 +6,7 @@ import typer
 
 from alpasim_plugin.lab.cli import (
     adapt,
+    train_detector,
     train_fixer,
     train_pairs,
     train_per_frame,
@@ -27,5 +28,6 @@ app.command("pairs", epilog=train_pairs.EPILOG)(train_pairs.pairs)
 app.command("photographs", epilog=train_photographs.EPILOG)(train_photographs.photographs)
 app.command("per-frame", epilog=train_per_frame.EPILOG)(train_per_frame.per_frame)
 app.command("fixer", epilog=train_fixer.EPILOG)(train_fixer.fixer)
+app.command("detector", epilog=train_detector.EPILOG)(train_detector.detector)
 app.command("policy", epilog=train_policy.EPILOG)(train_policy.policy)
 app.command("adapt", epilog=adapt.EPILOG)(adapt.adapt)

@@ -11,10 +11,12 @@ from alpasim_plugin.lab.bench.quality import VERSION, metric_digests
 from alpasim_plugin.lab.paper.config import RAW, PaperConfig, SceneSet, system_of
 from alpasim_plugin.lab.paper.records import QUALITY_FILE, SUMMARY_FILE
 from alpasim_plugin.lab.paper.stages import Stage
+from alpasim_plugin.lab.training.detectors import RECORD_FILE
 from alpasim_plugin.lab.training.recipes.ablation import BASE, BASE_BI
 from alpasim_plugin.lab.training.recipes.recipe import INIT, INIT_BI, Recipe
 from alpasim_plugin.lab.training.recipes.registry import recipe_of
 from alpasim_plugin.lab.training.vae import VAE_FILE
+from alpasim_plugin.lab.video_metrics.detectors import FILES, available_detectors
 
 BUNDLE = "fixer.safetensors"
 CARD = "fixer.card.json"
@@ -23,6 +25,7 @@ PAIRS_TEST = "pairs-test"
 AUTOENCODER = "autoencoder"
 DRIVE = "drive"
 TIMES = "times"
+DETECTORS = "detectors"
 TRUTH_ROWS = "truth-rows"  # folder of the experiment: rows of the clean frames, measured once
 RUN = "run"  # the run folder in the stage's
 
@@ -83,9 +86,10 @@ def comparison(
     """
     rows = list(dict.fromkeys((*first, *config.labels)))
     measured = [row for row in rows if row in config.labels and row != RAW]
-    stages = _pairs(PAIRS_TEST, config.test, effort)
-    stages.append(_quality(RAW, config, weights, effort, out))
-    stages += [*_pairs(PAIRS_TRAIN, config.train, effort), _autoencoder(config, effort)]
+    stages = [*_pairs(PAIRS_TEST, config.test, effort), *_pairs(PAIRS_TRAIN, config.train, effort)]
+    if trains_detectors(config, weights):
+        stages.append(_detectors(config, effort))
+    stages += [_quality(RAW, config, weights, effort, out), _autoencoder(config, effort)]
     for row in measured:
         stages += _not_yet(stages, _trainings(config, [row], effort))
         stages.append(_quality(row, config, weights, effort, out))
@@ -165,6 +169,26 @@ def _autoencoder(config: PaperConfig, effort: Effort) -> Stage:
         effort=_computed(effort),
         budget=_updates(updates),
         products=(VAE_FILE,),
+    )
+
+
+def trains_detectors(config: PaperConfig, weights: Path | None) -> bool:
+    """Whether our own detectors are trained: where they have updates and the user gives none."""
+    return config.training.detector_updates is not None and not available_detectors(weights)
+
+
+def _detectors(config: PaperConfig, effort: Effort) -> Stage:
+    training = config.training
+    words = ["train", "detector", f"{{{PAIRS_TRAIN}}}", "--out", "{out}"]
+    words += ["--check", f"{{{PAIRS_TEST}}}", "--check-split", config.test.split]
+    words += ["--steps", str(training.detector_updates), "--seed", str(training.seed)]
+    return Stage(
+        DETECTORS,
+        tuple(words),
+        (PAIRS_TRAIN, PAIRS_TEST),
+        effort=_computed(effort),
+        budget=f"{training.detector_updates} updates of each",
+        products=(*FILES.values(), RECORD_FILE),
     )
 
 
@@ -270,11 +294,16 @@ def _quality(
     extra += ["--truth-rows", str(out / TRUTH_ROWS)]
     if weights is not None:
         extra += ["--metric-weights", str(weights)]
+    detectors = []
+    if trains_detectors(config, weights):
+        detectors.append(DETECTORS)
+        words += ["--detectors", f"{{{DETECTORS}}}"]
+    networks = metric_digests(weights, weights)
     return Stage(
         quality_name(row),
         (*words, "--out", "{out}"),
-        (PAIRS_TEST, *_trained([row])),
-        {"version": VERSION, "networks": metric_digests(weights), "device": effort.device},
+        (PAIRS_TEST, *detectors, *_trained([row])),
+        {"version": VERSION, "networks": networks, "device": effort.device},
         tuple(extra),
         f"{config.test.scenes} clips of up to {config.frames} frames",
         (QUALITY_FILE,),

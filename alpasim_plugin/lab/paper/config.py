@@ -45,6 +45,9 @@ class Training(_Strict):
     autoencoder_updates: int = Field(ge=1, description="Of the autoencoder.")
     base_updates: int = Field(ge=1, description="Of each common initialisation.")
     updates: int = Field(ge=1, description="U: of a stage of share 1 (docs/lab/arms.md).")
+    detector_updates: int | None = Field(
+        default=None, ge=1, description="Of our own detectors; none: there are none."
+    )
     updates_of: dict[str, int] = Field(default={}, description="U of single systems.")
     size: str = Field(default="256x144", description="Of the sequences, WIDTHxHEIGHT.")
     clips: int = Field(default=4, ge=1, description="Clips of a batch.")

@@ -28,6 +28,7 @@ from alpasim_plugin.core.parts.source import package_digest
 MARKER = "stage.json"
 FOLDER = "stages"
 KEY_DIGITS = 12
+WEIGHTS = (".safetensors", ".pt")
 OWN = "out"  # the placeholder of a stage's folder
 State = Literal["done", "begun", "open"]
 Execute = Callable[[Sequence[str]], None]
@@ -62,7 +63,7 @@ class Stage:
     @property
     def is_training(self) -> bool:
         """Whether its products are weights."""
-        return any(name.endswith(".safetensors") for name in self.products)
+        return any(name.endswith(WEIGHTS) for name in self.products)
 
     @property
     def is_measurement(self) -> bool:

@@ -19,6 +19,7 @@ from alpasim_plugin.core.types import F64, CameraSpec, RenderRequest, Scenario
 from alpasim_plugin.fixers.semantic_map.draw import draw_map
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes, prepare_map
 from alpasim_plugin.gaussians.scene.log_views import log_actors
+from alpasim_plugin.lab.training.lane_lines import lateral_positions, lines_of, write_lanes
 from alpasim_plugin.lab.training.pair_store import Pair, is_made, write_sequence
 from alpasim_plugin.lab.training.reference_store import FrameGeometry, write_references
 from alpasim_plugin.renderers import make_renderer
@@ -90,15 +91,17 @@ def make_sequence(
     camera = _camera(scenario, recipe.camera)
     source = make_renderer(recipe.source, scenario, seed, device, threads=1)
     geometry: list[FrameGeometry] = []
+    lanes: list[F64] = []
     recorded = [frame for frame in source.recorded() if frame.camera == camera.name]
 
     def beside(partial: Path) -> None:
+        write_lanes(partial, lanes)
         if recorded:
             write_references(partial, geometry, recorded, scenario.actors)
 
     write_sequence(
         folder,
-        pair_frames(scenario, camera, recipe, seed, source, geometry, device),
+        pair_frames(scenario, camera, recipe, seed, source, geometry, lanes, device),
         len(_times(scenario, recipe)),
         {**info, **_camera_and_actors(scenario, camera)},
         beside,
@@ -134,13 +137,15 @@ def pair_frames(
     seed: int,
     source: Renderer,
     geometry: list[FrameGeometry],
+    lanes: list[F64],
     device: str,
 ) -> Iterator[Pair]:
     """Yield the frames of one sequence in order of time, and append depth and actors of each to
-    ``geometry``.
+    ``geometry``, its lane lines to ``lanes``.
     """
     target = make_renderer(recipe.target, scenario, seed, device, threads=1)
     layers = prepare_map(scenario.lane_map)
+    lines = lines_of(scenario.lane_map)
     offset_m = lateral_offsets(scenario, recipe, seed)
     for i, t_us in enumerate(_times(scenario, recipe)):
         T_world_camera = offset_from_log(scenario, t_us, float(offset_m[i])) @ camera.T_rig_camera
@@ -153,6 +158,7 @@ def pair_frames(
                 "choose a renderer that gives both",
             )
         geometry.append(FrameGeometry(damaged.depth.astype(np.float16), actors))
+        lanes.append(lateral_positions(lines, camera, T_world_camera))
         opacity = np.rint(damaged.alpha * 255).clip(0, 255).astype(np.uint8)
         sdmap = draw_map(
             layers, camera, T_world_camera, actor_boxes(actors, scenario.actors), threads=1

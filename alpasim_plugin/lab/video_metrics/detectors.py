@@ -1,4 +1,5 @@
-"""Detectors that the user gives as TorchScript programs, and what they find in a video.
+"""Detectors that the user gives as exported programs, and what they find in a video: TorchScript
+(``.pt``), or ONNX (``.onnx``) with inputs named ``image`` and ``K`` and three outputs in this order.
 
 ``cuboid_detector.pt``: ``forward(image, K) -> (boxes, scores, labels)``
     image   ``(3, H, W)`` float32 RGB, 0 to 1, scaled to a focal length of 1266.42 px
@@ -17,9 +18,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,22 +30,38 @@ from torch import Tensor
 
 from alpasim_plugin.core.errors import EvaluatorError, InputError
 from alpasim_plugin.core.files import file_sha256
-from alpasim_plugin.core.types import F64, U8
+from alpasim_plugin.core.types import F32, F64, U8
 from alpasim_plugin.lab.video_metrics.cuboids import FOCAL_PX, Boxes
 from alpasim_plugin.lab.video_metrics.lanes import Lanes
+from alpasim_plugin.lab.video_metrics.onnx_program import load_onnx
 from alpasim_plugin.lab.video_metrics.torchscript import load_script
 
 CUBOIDS = "cuboid_f1"
 LANES = "lane_f1"
 FILES = {CUBOIDS: "cuboid_detector.pt", LANES: "lane_detector.pt"}
+ONNX = ".onnx"
 
 
 def available_detectors(folder: Path | None) -> dict[str, str]:
-    """Return the metrics whose detector is in a folder of weights, each with its SHA-256."""
+    """Return the metrics whose detector is in a folder of weights, each with its SHA-256.
+
+    Raises:
+        InputError: A detector in both formats.
+    """
     if folder is None:
         return {}
-    paths = {name: folder / file for name, file in FILES.items()}
-    return {name: file_sha256(path) for name, path in paths.items() if path.is_file()}
+    paths = {name: _file(folder, name) for name in FILES}
+    return {name: file_sha256(path) for name, path in paths.items() if path is not None}
+
+
+def _file(folder: Path, name: str) -> Path | None:
+    program = folder / FILES[name]
+    paths = [path for path in (program, program.with_suffix(ONNX)) if path.is_file()]
+    if len(paths) > 1:
+        raise InputError(
+            f"{folder}: {paths[0].name} and {paths[1].name}", "Leave one of them there."
+        )
+    return paths[0] if paths else None
 
 
 def detect_boxes(video: U8, K: F64, folder: Path) -> Iterator[Boxes]:
@@ -56,7 +74,7 @@ def detect_boxes(video: U8, K: F64, folder: Path) -> Iterator[Boxes]:
     scaled_K = np.diag([scale, scale, 1.0]) @ K
     for frame in video:
         large = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
-        boxes, scores, labels = _call(folder / FILES[CUBOIDS], large, scaled_K)
+        boxes, scores, labels = _call(folder, CUBOIDS, large, scaled_K)
         count = len(boxes)
         _check("boxes", boxes, (count, 7))
         _check("scores", scores, (count,))
@@ -71,7 +89,7 @@ def detect_lanes(video: U8, K: F64, folder: Path) -> Iterator[Lanes]:
         EvaluatorError: A detector that does not answer as this module says.
     """
     for frame in video:
-        points, visible, scores = _call(folder / FILES[LANES], frame, K)
+        points, visible, scores = _call(folder, LANES, frame, K)
         count, samples = points.shape[:2] if points.ndim == 3 else (0, 0)
         _check("points", points, (count, samples, 3))
         _check("visible", visible, (count, samples))
@@ -94,15 +112,15 @@ def intrinsics_of(camera: object, clip: str) -> F64:
     return np.array(K, dtype=np.float64)
 
 
-def _call(path: Path, image: U8, K: F64) -> tuple[F64, ...]:
-    tensor = torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255
-    with torch.inference_mode():
-        answer = _network(path)(tensor, torch.from_numpy(K).float())
-    if not isinstance(answer, tuple) or len(answer) != 3:
+def _call(folder: Path, name: str, image: U8, K: F64) -> tuple[F64, ...]:
+    path = _file(folder, name)
+    if path is None:
+        raise InputError(f"{folder}: no {FILES[name]}", HINT)
+    levels = np.ascontiguousarray(np.moveaxis(image, -1, 0), dtype=np.float32) / np.float32(255)
+    answer = _network(path)(levels, K.astype(np.float32))
+    if len(answer) != 3:
         raise EvaluatorError(f"{path}: it did not return three tensors", HINT)
-    if not all(isinstance(part, Tensor) for part in answer):
-        raise EvaluatorError(f"{path}: it did not return three tensors", HINT)
-    return tuple(np.asarray(part.double().numpy()) for part in answer)
+    return tuple(np.asarray(part, dtype=np.float64) for part in answer)
 
 
 HINT = "export the detector as docs/lab/video-metrics.md says"
@@ -114,6 +132,22 @@ def _check(name: str, values: F64, shape: tuple[int, ...]) -> None:
         raise EvaluatorError(f"{name} of the detector: {problem}", HINT)
 
 
+Program = Callable[[F32, F32], tuple[Any, ...]]
+
+
 @cache
-def _network(path: Path) -> torch.nn.Module:
-    return load_script(path)
+def _network(path: Path) -> Program:
+    return load_onnx(path) if path.suffix == ONNX else _torchscript(path)
+
+
+def _torchscript(path: Path) -> Program:
+    program = load_script(path)
+
+    def call(image: F32, K: F32) -> tuple[Any, ...]:
+        with torch.inference_mode():
+            answer = program(torch.from_numpy(image), torch.from_numpy(K))
+        if not isinstance(answer, tuple) or not all(isinstance(part, Tensor) for part in answer):
+            raise EvaluatorError(f"{path}: it did not return three tensors", HINT)
+        return tuple(part.numpy() for part in answer)
+
+    return call

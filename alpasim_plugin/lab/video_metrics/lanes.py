@@ -47,6 +47,17 @@ class Lanes:
         return np.array(kept).reshape(-1, len(SAMPLES_M))
 
 
+def lanes_at(positions: F64) -> Lanes:
+    """Return lanes by their lateral positions ``(L, 29)`` at `SAMPLES_M` ahead, metres; NaN where they
+    are not.
+    """
+    visible = ~np.isnan(positions)
+    points = np.zeros((*positions.shape, 3))
+    points[..., 0] = np.where(visible, positions, 0.0)
+    points[..., 1] = SAMPLES_M
+    return Lanes(points, visible, np.ones(len(positions)))
+
+
 @dataclass(frozen=True)
 class LaneMatches:
     """Lanes of a clip: matched, of the video alone, of the truth alone; mean lateral error, metres,
@@ -63,6 +74,18 @@ class LaneMatches:
         """``2 TP / (2 TP + FP + FN)``; None where neither has a lane."""
         total = 2 * self.matched + self.extra + self.missed
         return 2 * self.matched / total if total else None
+
+    @property
+    def precision(self) -> float | None:
+        """``TP / (TP + FP)``; None where the video has no lane."""
+        total = self.matched + self.extra
+        return self.matched / total if total else None
+
+    @property
+    def recall(self) -> float | None:
+        """``TP / (TP + FN)``; None where the truth has no lane."""
+        total = self.matched + self.missed
+        return self.matched / total if total else None
 
 
 def lane_matches(made: Iterable[Lanes], true: Iterable[Lanes]) -> LaneMatches:

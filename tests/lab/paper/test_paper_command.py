@@ -25,6 +25,7 @@ least_power: 0.0
 training:
   autoencoder_updates: 1
   base_updates: 1
+  detector_updates: 1
   updates: 1
   updates_of: {V9: UPDATES}
   clips: 1
@@ -102,6 +103,8 @@ def test_a_stopped_comparison_goes_on_and_another_budget_remakes_what_depends_on
     assert log == list(range(1, STOP_AT + 1))  # the update after the checkpoint was made again
     assert json.loads((folder / "stage.json").read_text())["was_resumed"] is True
 
+    right = json.loads((kept / "detectors" / "detectors.json").read_text())["clean_frames"]
+    assert set(right["cuboid_f1"]) == set(right["lane_f1"]) == {"precision", "recall", "f1"}
     cell = record["tables"]["ablation"]["V2"]["lpips"]
     assert (cell["metric"], cell["paper"]) == ("perceptual-syn", ".155±.017")
     measured = next((tmp_path / "o" / "stages").glob("quality-V2-*")) / "quality.json"

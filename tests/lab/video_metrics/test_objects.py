@@ -1,9 +1,11 @@
 """Cuboid F1 and Lane F1 of made-up detections whose overlap is known, and of made-up detectors."""
 
+import sys
+
 import numpy as np
 import pytest
 
-from alpasim_plugin.core.errors import EvaluatorError, InputError
+from alpasim_plugin.core.errors import EvaluatorError, InfrastructureError, InputError
 from alpasim_plugin.fixers.semantic_map.style import BOX_COLOURS, COLOURS
 from alpasim_plugin.lab.video_metrics.cuboids import Boxes, drawn_vehicles, overlap
 from alpasim_plugin.lab.video_metrics.detectors import (
@@ -12,8 +14,9 @@ from alpasim_plugin.lab.video_metrics.detectors import (
     detect_boxes,
     intrinsics_of,
 )
-from alpasim_plugin.lab.video_metrics.lanes import Lanes, lane_matches, match
-from alpasim_plugin.lab.video_metrics.objects import object_metrics
+from alpasim_plugin.lab.video_metrics.lanes import SAMPLES_M, Lanes, lane_matches, match
+from alpasim_plugin.lab.video_metrics.objects import clean_metrics, detect_objects, object_metrics
+from alpasim_plugin.lab.video_metrics.onnx_program import load_onnx
 from alpasim_plugin.lab.video_metrics.summary import summarise
 from tests.lab.video_metrics.scripted_detectors import BoxDetector, LaneDetector, save_script
 
@@ -141,7 +144,14 @@ def test_detectors_from_files_are_asked_about_both_videos(tmp_path):
     assert sorted(available_detectors(tmp_path)) == ["cuboid_f1", "lane_f1"]
     sdmap = video(0)
     sdmap[:, 8:10, 14:18] = BOX_COLOURS["car"][0]
-    values = object_metrics(video(204), video(51), sdmap, SMALL_K, tmp_path)
+    true = detect_objects(video(51), SMALL_K, tmp_path)
+    values = object_metrics(detect_objects(video(204), SMALL_K, tmp_path), true)
+    line = np.where(SAMPLES_M < 40.0, 0.4, np.nan)
+    beside = np.where(SAMPLES_M < 40.0, -5.0, np.nan)
+    values |= clean_metrics(true, sdmap, [np.stack([line, beside])] * 2)
+    assert values["lane_clean_precision"] == 1.0
+    assert values["lane_clean_recall"] == 0.5
+    assert "lane_clean_recall" not in clean_metrics(true, sdmap, None)
     assert values["cuboid_f1"] == pytest.approx((4 - 2.4) / 4, abs=0.01)
     assert values["cuboid_clean_precision"] == pytest.approx(3.2 / 4, abs=0.01)
     assert values["cuboid_clean_recall"] == pytest.approx(3.2 / 4, abs=0.01)
@@ -150,8 +160,16 @@ def test_detectors_from_files_are_asked_about_both_videos(tmp_path):
     (found, _) = detect_boxes(video(51), SMALL_K, tmp_path)
     assert found.size == (2280, 4053)
     assert found.K[0, 0] == pytest.approx(1266.42)
-    blind = object_metrics(video(0), video(0), video(0), SMALL_K, tmp_path)
-    assert sorted(blind) == ["lane_error_m", "lane_f1"]
+    nothing = detect_objects(video(0), SMALL_K, tmp_path)
+    assert sorted(object_metrics(nothing, nothing)) == ["lane_error_m", "lane_f1"]
+
+
+def test_every_fifth_frame_is_searched(tmp_path):
+    save_script(LaneDetector(), tmp_path / FILES["lane_f1"])
+    frames = np.concatenate([video(51), video(204)] * 3)[:11]
+    offsets = [lane.points[0, 0, 0] for lane in detect_objects(frames, SMALL_K, tmp_path).lanes]
+    assert offsets == pytest.approx([0.2, 0.2, 0.8])  # frames 0, 5 and 10
+    assert detect_objects(frames, SMALL_K, tmp_path).boxes is None
 
 
 def test_a_detector_that_answers_otherwise_and_a_clip_without_a_camera_are_said(tmp_path):
@@ -161,6 +179,69 @@ def test_a_detector_that_answers_otherwise_and_a_clip_without_a_camera_are_said(
     with pytest.raises(InputError, match="camera"):
         intrinsics_of({"lens": 3}, "clip")
     assert intrinsics_of({"K": SMALL_K.tolist()}, "clip").shape == (3, 3)
+
+
+def save_onnx(path, inputs=("image", "K")):
+    """Write a network that finds a lane as far to the side as the image is bright."""
+    onnx = pytest.importorskip("onnx")
+    helper, types = onnx.helper, onnx.TensorProto
+    ahead = np.linspace(3.0, 80.0, 40, dtype=np.float32)
+    line = np.stack([np.zeros(40), ahead, np.zeros(40)], axis=1).astype(np.float32)[None]
+    side = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (1, 40, 1))
+    values = {"line": line, "side": side, "visible": np.ones((1, 40), dtype=np.float32)}
+    values["scores"] = np.ones(1, dtype=np.float32)
+    constants = [onnx.numpy_helper.from_array(value, name) for name, value in values.items()]
+    nodes = [
+        helper.make_node("ReduceMean", [inputs[0]], ["bright"], keepdims=0),
+        helper.make_node("Mul", ["side", "bright"], ["aside"]),
+        helper.make_node("Add", ["line", "aside"], ["points"]),
+        helper.make_node("Identity", ["visible"], ["out_visible"]),
+        helper.make_node("Identity", ["scores"], ["out_scores"]),
+        helper.make_node("Identity", [inputs[1]], ["unused"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "lanes",
+        [
+            helper.make_tensor_value_info(name, types.FLOAT, shape)
+            for name, shape in zip(inputs, ([3, "h", "w"], [3, 3]), strict=True)
+        ],
+        [
+            helper.make_tensor_value_info(name, types.FLOAT, None)
+            for name in ("points", "out_visible", "out_scores")
+        ],
+        constants,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    path.write_bytes(model.SerializeToString())
+
+
+def test_a_detector_may_be_an_onnx_file(tmp_path):
+    pytest.importorskip("onnxruntime")
+    save_onnx(tmp_path / "lane_detector.onnx")
+    assert sorted(available_detectors(tmp_path)) == ["lane_f1"]
+    found = detect_objects(video(51), SMALL_K, tmp_path).lanes
+    assert [lane.points[0, 0, 0] for lane in found] == pytest.approx([0.2], rel=1e-5)
+    save_script(LaneDetector(), tmp_path / FILES["lane_f1"])
+    with pytest.raises(InputError, match=r"lane_detector\.pt and lane_detector\.onnx"):
+        available_detectors(tmp_path)
+
+
+def test_an_onnx_file_with_other_inputs_and_a_damaged_one_are_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    path = tmp_path / "lane_detector.onnx"
+    save_onnx(path, ("picture", "K"))
+    with pytest.raises(InputError, match="inputs picture, K"):
+        load_onnx(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(InputError, match="no ONNX network"):
+        load_onnx(path)
+
+
+def test_an_onnx_file_without_onnxruntime_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InfrastructureError, match="onnxruntime is not installed"):
+        load_onnx(tmp_path / "lane_detector.onnx")
 
 
 def test_clips_without_a_vehicle_are_left_out_of_the_mean():
