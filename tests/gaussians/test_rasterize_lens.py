@@ -24,6 +24,7 @@ from alpasim_plugin.gaussians.raster.lens_rays import (
     LENS_SMALL,
     tile_rays,
 )
+from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2
 from tests.gaussians.lens_reference import LensReference, least_distance_along
 from tests.gaussians.lens_scenes import (
     BACK,
@@ -162,6 +163,24 @@ def test_ellipses_of_the_image_are_those_of_the_definition(name, rolls):
     starts = [None, pose([0.2, 0.104, 0.3], [0.1, 0.2, 0.2])] if rolls else ()
     out = check([(world, None), (moved, T)], seen, starts, count=250)
     assert out.alpha.mean() > 0.05
+
+
+@pytest.mark.parametrize("antialias_px2", [0.0, 0.1])
+@pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])
+@pytest.mark.parametrize("name", FINE)
+def test_small_gaussians_are_drawn_as_ellipses_also_antialiased(name, rolls, antialias_px2):
+    seen = fine_camera(name, rolls)
+    small = largest_small(seen, 300, 22)
+    shares = []
+    for size in (0.5, 40.0):
+        world = replace(small, scales=size * small.scales)
+        prepared = replace(prepare(world), antialias_px2=antialias_px2)
+        splats = rasterize_lens.drawn_splats([(prepared, None)], seen, near_m=0.2, threads=1).splats
+        records = splats.records[: len(splats.ids) * splats.size].reshape(-1, splats.size)
+        assert len(records) > 100
+        shares.append(float(np.mean(records[:, INVERSE_O2] < 0)))
+    assert shares[0] > 0.9
+    assert shares[1] < 0.1
 
 
 def test_thin_poles_at_speed_stand_where_the_definition_puts_them():
