@@ -143,12 +143,21 @@ def write_cause(run: Run, cause: Cause) -> Path:
         document=Markup(as_json(document)),
         renderers=[name for name in names if name != rollout.renderer],
         has_images=bool(names),
+        camera_without_lens=_camera_without_lens(cause, document),
         has_drive=document["drive"] is not None,
         run=real(run.folder).name,
         report="../" * len(Path(rollout.path).parts) + "report.html",
     )
     write_text(path, html)
     return path
+
+
+def _camera_without_lens(cause: Cause, document: JsonObject) -> str:
+    """Return the name of the camera that was seen with where its lens projects nothing; else ""."""
+    if cause.log is None or document["lens"] is not None:
+        return ""
+    names = [camera.name for camera in cause.log.info["cameras"]]
+    return names[0] if names else ""
 
 
 def _drive(cause: Cause, log: RolloutLog, place: Place) -> JsonObject:

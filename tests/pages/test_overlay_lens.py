@@ -181,3 +181,31 @@ def test_a_lens_that_a_log_describes_wrongly_has_no_overlay():
     camera = camera_of("ftheta")
     falling = LensModel("ftheta", (0.0, -480.0))
     assert lens_data(CameraSpec("c", 960, 600, camera.K, np.eye(4), 0, falling), 480) is None
+
+
+# The page's elements and images are stand-ins; what is drawn on the canvas is kept.
+CAUSE = """
+const calls = [], keep = (name) => (...values) => calls.push([name, ...values.slice(1)]);
+const context = new Proxy({}, { get: (_, name) => keep(name), set: () => true });
+const canvas = { getContext: () => context };
+const byId = () => ({ textContent: "{}" }), createImageBitmap = async () => ({ width: 480, height: 300 });
+"""
+SHOW = """
+why.data = { lens: null, own: "3dgs", ego: {}, users: [], rear: 0 };
+why.wanted = new Set(["policy", "plan", "lanes", "route"]);
+const query = { seen: { "3dgs": { jpeg: "", t: 0 } }, said: { heat: [], lines: [], boxes: [["a car", 1, 2, 30, 40]] } };
+why.draw({ name: "3dgs", canvas, said: null }, query, 0).then(() => console.log(JSON.stringify([calls.map(([name]) => name), canvas.hidden])));
+"""
+
+
+def test_the_images_of_a_failure_are_shown_where_a_lens_projects_nothing():
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    page = (TEMPLATES / "cause.js").read_text().replace("why.start();", "")
+    script = CAUSE + (TEMPLATES / "overlay.js").read_text() + page + SHOW
+    ran = subprocess.run([node, "-e", script], capture_output=True, text=True, check=True)
+    calls, is_hidden = json.loads(ran.stdout)
+    assert calls == ["drawImage", "strokeRect", "fillText"]
+    assert not is_hidden
+    assert "data.lens ?" not in page  # the images do not wait for a lens

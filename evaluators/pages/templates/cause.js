@@ -21,7 +21,7 @@ const why = {
     const read = () => { this.wanted = new Set(boxes.filter((one) => one.checked).map((one) => one.value)); };
     boxes.forEach((one) => one.addEventListener("change", () => { read(); this.show(this.i); }));
     read();
-    this.stages = data.lens ? [...document.querySelectorAll("figure[data-renderer]")].map((figure) => ({ name: figure.dataset.renderer, canvas: figure.querySelector("canvas"), said: figure.querySelector("small") })) : [];
+    this.stages = [...document.querySelectorAll("figure[data-renderer]")].map((figure) => ({ name: figure.dataset.renderer, canvas: figure.querySelector("canvas"), said: figure.querySelector("small") }));
     scrub.max = String(queries.length - 1);
     scrub.addEventListener("input", () => this.show(Number(scrub.value)));
     byId("before").addEventListener("click", () => this.show(this.i - 1));
@@ -61,16 +61,19 @@ const why = {
     const context = canvas.getContext("2d");
     context.drawImage(image, 0, 0);
     for (const one of heat) context.drawImage(one, 0, 0, canvas.width, canvas.height);
-    const overlay = new Overlay(context, this.data.lens, this.data.rear), { wanted } = this;
+    const { wanted } = this, isOwn = name === this.data.own && wanted.has("policy");
+    if (isOwn) this.boxes(context, query.said);
+    if (!this.data.lens) return;
+    const overlay = new Overlay(context, this.data.lens, this.data.rear);
     overlay.at(heldPose(this.data.ego, seen.t));
     overlay.scene(this.data, this.data.users.keys(), seen.t, wanted);
     if (wanted.has("route")) overlay.lines([query.route], { colour: "#6ee787", width: 3, dash: [2, 6] });
     if (wanted.has("plan")) overlay.plan(query.plan, "#2f81f7", wanted.has("samples"));
-    if (name === this.data.own && wanted.has("policy")) this.own(context, overlay, query.said);
+    if (isOwn) overlay.lines(query.said.lines.map(([, line]) => line), { colour: "#d2a8ff", width: 2 });
   },
 
-  own(context, overlay, said) {
-    overlay.lines(said.lines.map(([, line]) => line), { colour: "#d2a8ff", width: 2 });
+  // What the policy marks in the image itself, in its pixels.
+  boxes(context, said) {
     Object.assign(context, { strokeStyle: "#ff7b72", fillStyle: "#ff7b72", lineWidth: 2, font: "12px system-ui, sans-serif" });
     for (const [name, x0, y0, x1, y1] of said.boxes) {
       context.strokeRect(x0, y0, x1 - x0, y1 - y0);
