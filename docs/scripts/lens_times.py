@@ -44,11 +44,12 @@ CAMERAS = {
 HEAD = ["lens", "pixels", "one pass, ms", "pinholes, ms", "ratio", "rolling, ms", "ratio"]
 
 
-def seen_through(camera: dict[str, object]) -> Scenario:
-    """Return the street with one camera."""
+def seen_through(camera: dict[str, object], street: str = "street0") -> Scenario:
+    """Return a street with one camera; which street depends on the name of the scenario's folder."""
     scene = {"version": 1, "extends": [str(STREET)], "cameras": [{"name": "lens", **camera}]}
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scene.yaml"
+        path = Path(folder) / street / "scene.yaml"
+        path.parent.mkdir()
         path.write_text(yaml.safe_dump(scene), encoding="utf-8")
         return load_scenario(path)
 
