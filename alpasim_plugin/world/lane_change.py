@@ -227,12 +227,14 @@ class _Place:
         )[0]
 
     def follower(self) -> _Follower:
-        """Return who drives behind, or beside with its nose behind the driver's."""
+        """Return who drives behind, or beside with its nose not ahead of the driver's."""
         s_m, offset_m = self.path.project(self.bodies.xy)
         _, yaw = self.path.at(s_m)
         behind_m = self.s_m - s_m
         counts = (np.abs(offset_m) < IN_LANE_M) & (np.cos(self.bodies.yaw - yaw) > SAME_WAY)
-        counts &= (behind_m > 0.0) & (behind_m < BEHIND_M)
+        # A longer driver is abreast of bodies whose middle is ahead of its own.
+        nose_behind_m = behind_m + self.bodies.half_length_m[self.row] - self.bodies.half_length_m
+        counts &= (nose_behind_m >= 0.0) & (behind_m < BEHIND_M)
         counts[self.row] = False
         if not counts.any():
             return _Follower(np.inf, 0.0)

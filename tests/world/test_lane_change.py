@@ -15,6 +15,7 @@ from alpasim_plugin.world.path import polyline_path
 from tests.world.small_maps import make, straight
 
 CAR = Box(4.6, 1.85, 1.5)
+TRUCK = Box(12.0, 2.5, 3.0)
 AWAY = EgoState(0, se2(0.0, 500.0, 0.0), 0.0)
 STEP_US = 100_000
 LEFT_M = 3.5
@@ -110,7 +111,7 @@ def test_nobody_changes_into_oncoming_traffic_or_in_a_junction():
         assert np.abs(poses["fast"][:, 1, 3]).max() < 0.01
 
 
-def gain(others, politeness=0.0):
+def gain(others, politeness=0.0, own_box=CAR):
     """The gain of a driver at 100 m and 10 m/s, who wants 14 m/s, of a change to the left."""
     path = polyline_path(
         np.column_stack([np.arange(0.0, 601.0), np.zeros(601), np.full(601, 0.75)])
@@ -118,7 +119,8 @@ def gain(others, politeness=0.0):
     places = np.array([(100.0, 0.0, 10.0), *others])
     velocity = np.column_stack([places[:, 2], 0 * places[:, 2]])
     heights = np.full(len(places), 0.75)
-    bodies = bodies_from(places[:, :2], 0 * places[:, 2], [CAR] * len(places), velocity, heights)
+    boxes = [own_box, *[CAR] * len(others)]
+    bodies = bodies_from(places[:, :2], 0 * places[:, 2], boxes, velocity, heights)
     params = IdmParams(14.0, politeness=politeness)
     (change,) = LanesBeside.of(street()).changes(path, 100.0, 10.0, 0.75)
     leader = next((x - CAR.length_m - 100.0, v) for x, y, v in others if y == 0.0 and x > 100.0)
@@ -148,3 +150,9 @@ def test_nobody_changes_where_the_new_follower_had_to_brake_hard(behind_m):
     found, _, params = gain([ahead, (100.0 - behind_m, LEFT_M, speed_mps)])
     assert found <= params.change_gain_mps2
     assert not found > 0.0
+
+
+@pytest.mark.parametrize("ahead_m", [-6.0, -1.0, 0.0, 2.0, 3.5])
+def test_a_truck_does_not_change_onto_a_car_abreast_of_it(ahead_m):
+    found, _, _ = gain([(140.0, 0.0, 4.0), (100.0 + ahead_m, LEFT_M, 10.0)], own_box=TRUCK)
+    assert found == -np.inf
