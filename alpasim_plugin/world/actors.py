@@ -203,9 +203,7 @@ class Actors:
                     continue
                 if self._beside is not None:
                     surroundings = (everybody, first_moving + row)
-                    changed |= driver.change_lane(
-                        self._beside, motion, accel_mps2, surroundings, to_us
-                    )
+                    changed |= driver.change_lane(self._beside, motion, leader, surroundings, to_us)
                 driver.move(motion, accel_mps2, dt_s)
             if changed:
                 self._put_on_lines()
@@ -537,29 +535,32 @@ class _Driver:
         self,
         beside: LanesBeside,
         motion: _Motion,
-        accel_mps2: float,
+        leader: Leader,
         surroundings: tuple[Bodies, int],
         t_us: int,
     ) -> bool:
-        """Take the way into a lane beside where that is worth it, and return whether it is.
+        """Take the way into a lane beside where that is worth it, and return whether it is. Lights and
+        lines to give way at hold both lanes, so that only leaders are compared.
 
         Args:
             beside: Finds such lanes.
             motion: Where the driver is; its course changes.
-            accel_mps2: Its acceleration if it stays.
+            leader: Whom it follows if it stays.
             surroundings: Everybody, and the driver's row among them.
             t_us: Now.
         """
         params = at_place(self.params, motion.course.path, motion.course.wanted_mps, motion.s_m)
         free_mps2 = idm_acceleration(motion.speed_mps, np.inf, 0.0, params)
-        nothing_to_gain = not free_mps2 - accel_mps2 > params.change_gain_mps2
+        closing_mps = motion.speed_mps - leader.speed_mps
+        now_mps2 = idm_acceleration(motion.speed_mps, leader.gap_m, closing_mps, params)
+        nothing_to_gain = not free_mps2 - now_mps2 > params.change_gain_mps2
         if nothing_to_gain or t_us < motion.considers_us or self.act is not None:
             return False
         motion.considers_us = t_us + CONSIDERS_US
         path = motion.course.path
         place = (path, motion.s_m, motion.speed_mps)
         changes = beside.changes(*place, self.actor.box.height_m / 2)
-        gains = [gain_mps2(change, *place, accel_mps2, *surroundings, params) for change in changes]
+        gains = [gain_mps2(change, *place, now_mps2, *surroundings, params) for change in changes]
         if not gains or max(gains) <= params.change_gain_mps2:
             return False
         way = changes[int(np.argmax(gains))].way

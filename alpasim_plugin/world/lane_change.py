@@ -162,7 +162,7 @@ def gain_mps2(
         path: The driver's way.
         s_m: Where it is.
         speed_mps: Its speed.
-        now_mps2: Its acceleration in its lane.
+        now_mps2: Its acceleration behind its leader.
         bodies: Everybody.
         row: The driver's row among them.
         params: The driver, whose parameters stand for its followers' too.

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from alpasim_plugin.core.geometry import quat_from_yaw, rectangle_corners, se2, yaw_of
-from alpasim_plugin.core.types import Actor, Behaviour, Box, EgoState, Trajectory, Vehicle
+from alpasim_plugin.core.types import Actor, Behaviour, Box, EgoState, Signal, Trajectory, Vehicle
 from alpasim_plugin.world.actors import Actors
 from alpasim_plugin.world.idm import IdmParams, bodies_from, idm_acceleration
 from alpasim_plugin.world.lane_change import LanesBeside, gain_mps2
@@ -79,6 +79,14 @@ def test_a_driver_passes_a_slow_one_in_the_lane_beside():
     for t_us in range(0, 600_001, STEP_US):
         again = world.step(t_us, AWAY)
     assert again["fast"][1, 3] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_red_light_that_holds_both_lanes_is_no_reason_to_change():
+    stop = np.array([[200.0, -2.0, 0.0], [200.0, 6.0, 0.0]])
+    red = Signal(stop, 0.0, (("red", 60_000_000),))
+    poses, _ = driven([driver("a", 100.0, 12.0)], replace(street(), signals=(red,)), 12_000_000)
+    assert np.abs(poses["a"][:, 1, 3]).max() < 0.01
+    assert poses["a"][-1, 0, 3] < 200.0
 
 
 @pytest.mark.parametrize(
