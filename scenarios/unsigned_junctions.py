@@ -45,7 +45,7 @@ def priority_lines(
         if gives is not None:
             goes = second if gives == first else first
             yields.setdefault(gives, []).append(goes)
-    waiting = _without_rings(yields)
+    waiting = _without_rings(yields, junctions.before)
     return tuple(_line(lanes[key], yields[key], waiting[key]) for key in yields)
 
 
@@ -145,23 +145,63 @@ def _held(signals: Iterable[Signal], lanes: Mapping[str, Lane]) -> set[str]:
     return {key for signal in vehicles for key in through_junction(signal, lanes)}
 
 
-def _without_rings(yields: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """Return for each lane those that go first even where their traffic waits: in a ring of lanes
-    each of which gives way to the next one only those with an earlier name, so that nobody waits
-    for ever.
+def _without_rings(
+    yields: Mapping[str, Sequence[str]], before: Mapping[str, Sequence[str]]
+) -> dict[str, list[str]]:
+    """Return for each lane those that go first even where their traffic waits, so that nobody waits
+    for ever: of approaches in a ring, each of which waits for the next one, only those with an earlier
+    name. Who waits stands before all lanes of an approach, and nobody sees which one it will take.
+
+    Args:
+        yields: The lanes that go first, for each that gives way.
+        before: The lanes that lead to each.
     """
     keys = sorted({*yields, *(key for goes in yields.values() for key in goes)})
-    number = {key: n for n, key in enumerate(keys)}
-    links = [(number[key], number[goes]) for key, all_goes in yields.items() for goes in all_goes]
-    if not links:
-        return {}
-    rows, columns = np.array(links).T
-    graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=2 * (len(keys),))
-    _, ring = scipy.sparse.csgraph.connected_components(graph, connection="strong")
+    approach = _approaches(keys, before)
+    number = {name: n for n, name in enumerate(dict.fromkeys(approach.values()))}
+    links = [
+        (number[approach[key]], number[approach[goes]])
+        for key, all_goes in yields.items()
+        for goes in all_goes
+    ]
+    ring = _connected(links, len(number), "strong")
+    ring_of = {key: ring[number[approach[key]]] for key in keys}
     return {
-        key: [goes for goes in all_goes if ring[number[key]] != ring[number[goes]] or goes < key]
+        key: [
+            goes
+            for goes in all_goes
+            if ring_of[key] != ring_of[goes] or approach[goes] < approach[key]
+        ]
         for key, all_goes in yields.items()
     }
+
+
+def _approaches(keys: Sequence[str], before: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return the name of each lane's approach, which lanes share that one lane leads to: the first of
+    their names.
+    """
+    number = {key: n for n, key in enumerate(keys)}
+    first_after: dict[str, str] = {}
+    links = [
+        (number[key], number[first_after.setdefault(name, key)])
+        for key in keys
+        for name in before[key]
+    ]
+    group = _connected(links, len(keys), "weak")
+    names: dict[int, str] = {}
+    return {key: names.setdefault(group[number[key]], key) for key in keys}
+
+
+def _connected(links: Sequence[tuple[int, int]], count: int, connection: str) -> list[int]:
+    """Return the connected component of each of ``count`` nodes."""
+    if not links:
+        return list(range(count))
+    rows, columns = np.array(links).T
+    graph = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    labels: list[int] = scipy.sparse.csgraph.connected_components(graph, connection=connection)[
+        1
+    ].tolist()
+    return labels
 
 
 def _line(lane: Lane, goes_first: Sequence[str], waiting: Sequence[str]) -> Signal:

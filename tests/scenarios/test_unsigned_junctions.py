@@ -1,5 +1,7 @@
 """Who goes first where neither a light nor a sign says it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,6 +100,22 @@ def test_in_a_ring_of_four_one_need_not_wait_for_who_waits():
         chain.append(waiting[0])
     pair = rules(crossing(("south", "east")))
     assert pair["south over"].yields_to_waiting == ("east over",)
+
+
+@pytest.mark.parametrize("signed", [(), ("east in", "west in")])
+def test_two_who_turn_left_towards_each_other_do_not_both_wait(signed):
+    """Each stands before the lane straight on too, which goes first."""
+    lanes = crossing()
+    arc = -lanes["south left"].centre[:, :2]
+    lanes["north left"] = lane("north left", arc, inside=True)
+    after = (*lanes["north in"].successors, "north left")
+    lanes["north in"] = replace(lanes["north in"], successors=after)
+    stop = np.array([[-5.0, -9.0, 0.0], [5.0, -9.0, 0.0]])
+    signs = [Signal(stop, 0.0, (), lanes=(key,)) for key in signed]
+    lines = {line.lanes[0]: line for line in priority_lines(lanes, (), signs)}
+    for_north = "north over" in lines["south left"].yields_to_waiting
+    for_south = "south over" in lines["north left"].yields_to_waiting
+    assert for_north != for_south
 
 
 def roundabout(radius=15.0, squeeze=1.0, corners=None):
