@@ -197,13 +197,19 @@ class Actors:
             )
             first_moving = len(others.xy)
             changed = False
+            # Who changes lanes is in both until it has.
+            in_lanes = concatenate([everybody, *_in_new_lanes(driving, to_us)])
             for row, ((driver, motion), leader) in enumerate(zip(driving, leaders, strict=True)):
                 accel_mps2 = driver.accel_mps2(motion, leader, everybody, first_moving + row, to_us)
                 if motion.since_us > from_us:
                     continue
-                if self._beside is not None:
-                    surroundings = (everybody, first_moving + row)
-                    changed |= driver.change_lane(self._beside, motion, leader, surroundings, to_us)
+                surroundings = (in_lanes, first_moving + row)
+                if self._beside is not None and driver.change_lane(
+                    self._beside, motion, leader, surroundings, to_us
+                ):
+                    changed = True
+                    new_lane = _in_new_lanes([(driver, motion)], to_us)
+                    in_lanes = concatenate([in_lanes, *new_lane])
                 driver.move(motion, accel_mps2, dt_s)
             if changed:
                 self._put_on_lines()
@@ -350,6 +356,21 @@ def _bodies_on_lines(lines: Lines, line: I64, driving: Sequence[tuple[_Driver, _
     return bodies_from(xyz[:, :2], yaws, boxes, velocity, xyz[:, 2])
 
 
+def _in_new_lanes(driving: Sequence[tuple[_Driver, _Motion]], t_us: int) -> list[Bodies]:
+    """Return the drivers that change lanes now as bodies in the lanes into which they do, abreast of
+    where they are.
+    """
+    out = []
+    for driver, motion in driving:
+        if motion.into is None or t_us >= motion.considers_us:
+            continue
+        place, _ = motion.course.path.at(motion.s_m, motion.offset_m)
+        xyz, yaw = motion.into.at(float(motion.into.project(place[None, :2])[0][0]))
+        velocity = motion.speed_mps * direction_of(float(yaw))
+        out.append(bodies_from(xyz[:2], yaw, [driver.actor.box], velocity, xyz[2]))
+    return out
+
+
 @dataclass(frozen=True)
 class _Course:
     """A driver's way, and what stands on it.
@@ -388,6 +409,7 @@ class _Motion:
     offset_m: float  # left of the line, kept
     since_us: int  # when it left its track
     considers_us: int = 0  # when it next looks whether to change lanes
+    into: Path | None = None  # the middle of the lane into which it changes
 
 
 @dataclass(frozen=True)
@@ -557,18 +579,21 @@ class _Driver:
         if nothing_to_gain or t_us < motion.considers_us or self.act is not None:
             return False
         motion.considers_us = t_us + CONSIDERS_US
+        motion.into = None
         path = motion.course.path
         place = (path, motion.s_m, motion.speed_mps)
         changes = beside.changes(*place, self.actor.box.height_m / 2)
         gains = [gain_mps2(change, *place, now_mps2, *surroundings, params) for change in changes]
         if not gains or max(gains) <= params.change_gain_mps2:
             return False
-        way = changes[int(np.argmax(gains))].way
+        change = changes[int(np.argmax(gains))]
+        way = change.way
         place_xyz, _ = path.at(motion.s_m, motion.offset_m)
         s_m, offset_m = way.project_about(place_xyz[:2], min(motion.s_m, KEPT_M))
         motion.course = _Course.along(way, self.lane_map, self.params)
         motion.s_m, motion.offset_m = s_m, offset_m
         motion.considers_us = t_us + CHANGED_US
+        motion.into = change.along
         return True
 
     def move(self, motion: _Motion, accel_mps2: float, dt_s: float) -> None:

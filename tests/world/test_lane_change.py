@@ -89,6 +89,19 @@ def test_a_red_light_that_holds_both_lanes_is_no_reason_to_change():
     assert poses["a"][-1, 0, 3] < 200.0
 
 
+def test_two_do_not_change_into_one_place_from_both_sides():
+    lane_map = make(
+        straight("right", 0.0, 600.0, left_neighbour="middle"),
+        straight("middle", 0.0, 600.0, LEFT_M, left_neighbour="left", right_neighbour="right"),
+        straight("left", 0.0, 600.0, 2 * LEFT_M, right_neighbour="middle"),
+    )
+    slow = [driver("slow right", 60.0, 4.0), driver("slow left", 60.0, 4.0, 2 * LEFT_M)]
+    right = driver("right", 20.0, 10.0, wanted_mps=14.0)
+    left = driver("left", 23.0, 10.0, 2 * LEFT_M, wanted_mps=14.0)
+    poses, _ = driven([*slow, right, left], lane_map, 15_000_000)
+    assert least_gap_m(poses["right"], poses["left"]) > 0.5
+
+
 @pytest.mark.parametrize(
     ("gain_mps2", "beside"),
     [
