@@ -1,5 +1,8 @@
 """Check gradients through lenses against finite differences of the definition."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,7 @@ from alpasim_plugin.core.types import CameraSpec, LensModel
 from alpasim_plugin.gaussians import GaussianCloud, rasterize
 from alpasim_plugin.gaussians.cloud import sigmoid
 from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster import rasterize_lens_gradient
 from alpasim_plugin.gaussians.raster.rasterize_gradient import rasterize_gradient
 from alpasim_plugin.gaussians.raster.rasterize_lens import drawn_splats
 from alpasim_plugin.gaussians.raster.rasterize_lens_gradient import _is_along_ray, _prepared
@@ -205,6 +209,24 @@ def test_a_basis_that_jumps_is_that_of_the_records():
     s = scene(p, sizes, cam, quaternions=[1.0, 0.0, 0.0, 0.0])
     gradients, _ = kernel_gradients(s)
     assert_close(gradients, numeric(s), TOLERANCE)
+
+
+def test_memory_of_an_image_is_given_back_after_its_gradient(monkeypatch):
+    """A graph that holds its own images would be collected by nobody: every update of a fit would stay."""
+    views = []
+    init = rasterize_lens_gradient._LensView.__init__
+
+    def noted(view, *args):
+        init(view, *args)
+        views.append(weakref.ref(view))
+
+    monkeypatch.setattr(rasterize_lens_gradient._LensView, "__init__", noted)
+    cam = camera("opencv")
+    splats = splats_of(placed(AHEAD, [[0.5, 0.3, 0.4]], cam))
+    splats.means.requires_grad_()
+    rasterize_gradient(splats, cam, threads=1).rgb.sum().backward()
+    gc.collect()
+    assert [view() for view in views] == [None]
 
 
 def test_what_cannot_be_fitted_is_refused():

@@ -77,7 +77,8 @@ def rasterize_lens_gradient(
     index = torch.from_numpy(tile_splats.splats.ids)
     chosen = Splats(*(tensor.index_select(0, index) for tensor in splats))
     projected, uv = _projected(chosen, camera, tile_splats)
-    colour_sum, alpha, depth_sum = _CompositeLens.apply(*projected, view)  # type: ignore[no-untyped-call]
+    images = view.images()
+    colour_sum, alpha, depth_sum = _CompositeLens.apply(*projected, images, view)  # type: ignore[no-untyped-call]
     rgb = colour_sum
     if background is not None:
         rgb = rgb + (1 - alpha)[..., None] * background.float()
@@ -210,8 +211,13 @@ class _LensView:
         self.threads = threads
         tiles = len(tile_splats.tiles.starts) - 1
         self.kept: F32 = np.empty(tiles * 16 * KEPT, dtype=np.float32)
-        colour, alpha, depth = composite_lens(tile_splats, camera, self.kept, None, threads)
-        self.images = torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth)
+
+    def images(self) -> Images:
+        """Draw the images; they have a graph that holds this view, which therefore does not hold them."""
+        colour, alpha, depth = composite_lens(
+            self.tile_splats, self.camera, self.kept, None, self.threads
+        )
+        return torch.from_numpy(colour), torch.from_numpy(alpha), torch.from_numpy(depth)
 
     def sums(self, *gradients: Tensor) -> Tensor:
         """Return what each splat receives ``(LENS_PAIR, M)`` float64 of the gradients of the images."""
@@ -243,11 +249,11 @@ class _CompositeLens(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Images:
-        *tensors, view = inputs
+        *tensors, images, view = inputs
         ctx.save_for_backward(*tensors)
         ctx.view = view
-        images: Images = view.images
-        return images
+        output_images: Images = images
+        return output_images
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -271,6 +277,7 @@ class _CompositeLens(torch.autograd.Function):
             sums[PAIR_H].float(),
             by_colour.float(),
             sums[PAIR_DEPTH].float(),
+            None,
             None,
         )
 
