@@ -571,12 +571,14 @@ class _Driver:
             surroundings: Everybody, and the driver's row among them.
             t_us: Now.
         """
+        if self.act is not None or self.stands_at_end:  # its way is a part of the scene
+            return False
         params = at_place(self.params, motion.course.path, motion.course.wanted_mps, motion.s_m)
         free_mps2 = idm_acceleration(motion.speed_mps, np.inf, 0.0, params)
         closing_mps = motion.speed_mps - leader.speed_mps
         now_mps2 = idm_acceleration(motion.speed_mps, leader.gap_m, closing_mps, params)
         nothing_to_gain = not free_mps2 - now_mps2 > params.change_gain_mps2
-        if nothing_to_gain or t_us < motion.considers_us or self.act is not None:
+        if nothing_to_gain or t_us < motion.considers_us:
             return False
         motion.considers_us = t_us + CONSIDERS_US
         motion.into = None

@@ -29,7 +29,7 @@ from alpasim_plugin.world.route import LaneIndex
 CHANGE_S = 4.0  # a change takes so long ...
 SHORTEST_M = 15.0  # ... and at least this way
 BEHIND_M = 60.0  # followers are looked for so far behind
-AHEAD_M = 300.0
+AHEAD_M = 300.0  # leaders are looked for so far ahead, and a new way leads at least so far
 KEPT_M = 10.0  # of the own way behind the driver, which its rear is still on
 STEP_M = 2.0  # between points of a change
 ALONG_RAD = 0.3  # between lanes side by side that are driven the same way, at most
@@ -92,7 +92,7 @@ class LanesBeside:
         for key in beside:
             if key is None or key not in self._lanes or not self._is_along(key, foot, yaw):
                 continue
-            along = self._along(key, half_height_m)
+            along = self._along(key, half_height_m, max(AHEAD_M, path.length_m - s_m))
             at_m, offset_m = (float(a[0]) for a in along.path.project(place[None, :2]))
             if along.end_m - at_m >= length_m:
                 out.append(
@@ -105,12 +105,12 @@ class LanesBeside:
         turn_rad = float(wrap_angle(self._index.heading_rad(key, place) - yaw))
         return self._lanes[key].kind == "vehicle" and abs(turn_rad) < ALONG_RAD
 
-    def _along(self, key: str, half_height_m: float) -> _Along:
-        """Return the middle of a lane with those before and behind it."""
+    def _along(self, key: str, half_height_m: float, ahead_m: float) -> _Along:
+        """Return the middle of a lane with those before it, and with those behind it for ``ahead_m``."""
         chain = chains_to(key, self._lanes, self._before, BEHIND_M)[0]
         line = np.concatenate([self._lanes[name].centre for name in chain])
         end_m = polyline_path(line).length_m
-        ahead = self._index.path_ahead(key, AHEAD_M, start=line[-1]).xyz
+        ahead = self._index.path_ahead(key, ahead_m, start=line[-1]).xyz
         xyz = np.concatenate([line, ahead])
         xyz[:, 2] += half_height_m
         return _Along(polyline_path(xyz), end_m)

@@ -132,6 +132,27 @@ def test_nobody_changes_into_oncoming_traffic_or_in_a_junction():
         assert np.abs(poses["fast"][:, 1, 3]).max() < 0.01
 
 
+def test_a_new_way_leads_as_far_as_the_old_one():
+    """Its end is where the driver leaves the scene."""
+    right = straight("right", 0.0, 2000.0, left_neighbour="left")
+    left = straight("left", 0.0, 300.0, LEFT_M, right_neighbour="right", successors=("on",))
+    on = straight("on", 300.0, 2000.0, LEFT_M)
+    path = polyline_path(np.array([[0.0, 0.0, 0.75], [2000.0, 0.0, 0.75]]))
+    (change,) = LanesBeside.of(make(right, left, on)).changes(path, 100.0, 10.0, 0.75)
+    assert change.way.at(change.way.length_m)[0][0] >= 1997.0
+
+
+def test_who_stops_where_its_track_turns_back_stays_in_its_lane():
+    t_us = STEP_US * np.arange(111, dtype=np.int64)
+    seconds = t_us * 1e-6
+    x = 20.0 + np.where(seconds < 10.0, 10.0 * seconds, 100.0 - 5.0 * (seconds - 10.0))
+    track = Trajectory(t_us, np.column_stack([x, 0 * x, 0 * x + 0.75]), quat_from_yaw(0 * x))
+    parks = replace(driver("parks", 20.0, 10.0, wanted_mps=12.0), track=track)
+    poses, _ = driven([driver("slow", 60.0, 4.0), parks], street())
+    assert np.abs(poses["parks"][:, 1, 3]).max() < 0.01
+    assert poses["parks"][-1, 0, 3] == pytest.approx(120.0, abs=1.0)
+
+
 def gain(others, politeness=0.0, own_box=CAR):
     """The gain of a driver at 100 m and 10 m/s, who wants 14 m/s, of a change to the left."""
     path = polyline_path(
