@@ -10,6 +10,7 @@ import pytest
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.image_metrics import psnr_db
 from alpasim_plugin.core.types import CameraSpec, LensModel
+from alpasim_plugin.gaussians.fit import drive
 from alpasim_plugin.gaussians.fit.drive import prepared_views
 from alpasim_plugin.gaussians.fit.lens import (
     Lens,
@@ -87,13 +88,28 @@ def test_depth_of_the_image_without_distortion_is_distance_in_that_of_the_lens(n
     assert not distance[~reached].any()
 
 
-def test_what_is_measured_without_distortion_stands_in_views_that_stay_whole(posed):
+def test_what_is_measured_without_distortion_stands_in_views_that_stay_whole(posed, monkeypatch):
     views = [replace(seen(posed, "opencv", i), depth=None, sky=None) for i in range(4)]
-    done, _ = prepared_views(views, lambda *_: None)
-    for view, measured in zip(views, done, strict=True):
+    depths = [np.full((HEIGHT, WIDTH), 5.0 + i, dtype=np.float32) for i in range(4)]
+    upper = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
+    upper[: HEIGHT // 2] = True
+    gains = np.arange(12.0).reshape(4, 3) + 1
+    monkeypatch.setattr(drive, "LEAST_WAY_M", 0.1)
+    monkeypatch.setattr(drive, "depth_maps", lambda *_: depths)
+    monkeypatch.setattr(drive, "sky_masks", lambda images: [upper] * len(images))
+    monkeypatch.setattr(drive, "balances", lambda *_: gains)
+    done, _ = prepared_views(views[::-1], lambda *_: None)
+    for view, measured, depth, gain in zip(views, done, depths, gains, strict=True):
         assert measured.camera is view.camera
         assert measured.rgb is view.rgb
-        assert measured.depth.shape == view.rgb.shape[:2]
+        assert measured.gain == tuple(gain)
+        pinhole = without_distortion(view).pinhole
+        sky = through_lens(view.camera, pinhole, upper.astype(np.float32)) > 0
+        assert 0.1 < sky.mean() < 0.6
+        np.testing.assert_array_equal(measured.sky, sky)
+        distance = distances_through_lens(view.camera, pinhole, np.where(upper, 0, depth))
+        assert distance.max() > depth.max() + 0.1
+        np.testing.assert_array_equal(measured.depth, distance)
 
 
 def test_a_pinhole_is_measured_as_it_is(posed):
