@@ -21,7 +21,7 @@ from alpasim_plugin.core.files.images import PNG
 from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts.source import package_digest
-from alpasim_plugin.core.types import F64, CameraSpec, LaneMap
+from alpasim_plugin.core.types import F64, Actor, CameraSpec, LaneMap
 from alpasim_plugin.drives.held_out import fitted_part, held_out, measured
 from alpasim_plugin.drives.obstacles import standing_obstacles
 from alpasim_plugin.drives.opening import read_source
@@ -235,27 +235,14 @@ def _built(task: _Import, tell: Report) -> JsonObject:
     begin(work, task.key)
     write_photographs(work, photographs, tell)
     actors = placed.actors
-    views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
-    for photograph in photographs:
-        present = actors_at(actors, int(photograph.source.t_us or 0))
-        views[photograph.use].append(replace(photograph.view(through_lens), actors=present))
+    views = _views_by_use(photographs, actors, through_lens)
     visible_ids = {name for view in views["fitted"] for name in _in_view(view)}
 
     def preview(street: FittedDrive) -> None:
         noted = replace(drive, notes=(*drive.notes, PREVIEW_NOTE))
         _write_preview(task, noted, placed, roads, street, photographs, views, tell)
 
-    trials: list[Trial] = []
-
-    def tried(trial: Trial) -> None:
-        trials.append(trial)
-        tell(_expected(trial, task.device), 0, 0)
-
-    def told(stage: str, done: int, all: int, numbers: Mapping[str, float]) -> None:
-        # The second half of the updates takes longer; what is shown goes with the time.
-        share = trials[-1].share_of(done) if stage == FITTING and trials else done / max(all, 1)
-        tell(stage, round(all * share), all)
-
+    progress = _FitProgress(tell, task.device)
     near = placed.points.chosen(placed.points.spread < np.percentile(placed.points.spread, 90))
     done = fit_drive(
         views["fitted"],
@@ -265,9 +252,9 @@ def _built(task: _Import, tell: Report) -> JsonObject:
         scene_id=scene_id_of(drive),
         folder=work / FIT_FOLDER,
         seed=SEED,
-        report=told,
+        report=progress.show,
         preview=preview,
-        trial=tried,
+        trial=progress.say_time,
         recipe=task.recipe,
         device=task.device,
     )
@@ -278,6 +265,44 @@ def _built(task: _Import, tell: Report) -> JsonObject:
     require_covered(task.folder, on_path["share"], THIN_MODEL_HINT)
     shutil.rmtree(work / FIT_FOLDER, ignore_errors=True)
     return quality
+
+
+def _views_by_use(
+    photographs: Sequence[PlacedPhotograph], actors: Sequence[Actor], through_lens: bool
+) -> dict[str, list[PosedView]]:
+    """Return photographs as views of the width that is fitted, by what they are used for."""
+    views: dict[str, list[PosedView]] = {"fitted": [], "held-out": [], "never-fitted": []}
+    for photograph in photographs:
+        present = actors_at(actors, int(photograph.source.t_us or 0))
+        views[photograph.use].append(replace(photograph.view(through_lens), actors=present))
+    return views
+
+
+@dataclass
+class _FitProgress:
+    """Tells how long a fit takes, and how much of that time has passed.
+
+    Attributes:
+        tell: Called with it.
+        device: Where the fit is made.
+        trial: What its updates take; None where that was not tried.
+    """
+
+    tell: Report
+    device: str
+    trial: Trial | None = None
+
+    def say_time(self, trial: Trial) -> None:
+        """Say how long the fit takes."""
+        self.trial = trial
+        self.tell(_expected(trial, self.device), 0, 0)
+
+    def show(self, stage: str, done: int, all: int, numbers: Mapping[str, float]) -> None:
+        """Show how much of a stage is done; of the fit, whose later updates take longer, by time."""
+        share = done / max(all, 1)
+        if stage == FITTING and self.trial is not None:
+            share = self.trial.share_of(done)
+        self.tell(stage, round(all * share), all)
 
 
 def _write_preview(
