@@ -3,9 +3,9 @@
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.rows import Rollout
 from evaluators.metrics.measured import BEYOND, NOT_LOOKED_FOR, ON_PATH_M, OTHER_SCENE
-from evaluators.statistics.cause import beyond_reason
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run
+from evaluators.statistics.sentences import beyond_reason
 
 
 def measured_cautions(run: Run) -> list[str]:

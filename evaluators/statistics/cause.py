@@ -32,7 +32,7 @@ from evaluators.metrics.outcomes import (
 from evaluators.statistics.alike import common_to_failures
 from evaluators.statistics.evidence import Failure, contact_of_failure, failure_facts
 from evaluators.statistics.opening import Run
-from evaluators.statistics.sentences import seen_before
+from evaluators.statistics.sentences import beyond_reason, seen_before
 
 CHECK = "Check of the policy before the run: "
 # Notes of a check, and the outcomes beside which they are shown.
@@ -171,13 +171,6 @@ def cause_of(
     if rollout.ok and ended in ENDED:
         sentences.append(f"The rollout ended since {ENDED[ended]}.")
     return Cause(rollout, outcome, failed_us, start_us, sentences, partings, log, failure)
-
-
-def beyond_reason(scene: JsonView | None) -> str:
-    """Say what is not known beyond the range of a scene, whose file is given where there is one."""
-    if scene is not None and scene.get("plan_ranges"):
-        return "where its plans are not known to be near those behind clean"
-    return "where nothing was compared with a photograph"
 
 
 def beyond_sentences(steps: pa.Table, failed_us: int, reason: str) -> list[str]:

@@ -260,3 +260,10 @@ def seen_before(rows: Sequence[Mapping[str, Any]], t_us: int) -> str:
     return f"{guessed:.0%} of what it saw in the second before was made up by the fixer, {recorded:.0%} was recorded".replace(
         "%", " %"
     )
+
+
+def beyond_reason(scene: JsonView | None) -> str:
+    """Say what is not known beyond the range of a scene, whose file is given where there is one."""
+    if scene is not None and scene.get("plan_ranges"):
+        return "where its plans are not known to be near those behind clean"
+    return "where nothing was compared with a photograph"

@@ -84,8 +84,19 @@ def what_a_fit_reads(drive, monkeypatch, folder):
         raise PastPixelsError
 
     monkeypatch.setattr(build, "fit_drive", read)
+    task = build._Import(
+        drive=drive,
+        folder=folder,
+        out=folder / "out",
+        work=folder / "work",
+        key="",
+        camera_height_m=None,
+        map_file=None,
+        recipe=SplatRecipe.street(),
+        device="cpu",
+    )
     with pytest.raises(PastPixelsError):
-        build._built(drive, folder, folder / "work", "", None, None, lambda *stage: None, "cpu")
+        build._built(task, lambda *stage: None)
     return names, b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
 
 

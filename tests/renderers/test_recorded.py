@@ -59,7 +59,7 @@ def street(degradation):
 def test_a_built_scene_has_a_frame_of_every_camera_twice_a_second_never_at_the_time_of_a_rendered_one():
     scenario = street(Degradation("none"))
     scene = scene_of(scenario)
-    frames = built_recording(scenario, scene, scene.render, None)
+    frames = built_recording(scenario, scene, scene.render, None, scenario.cameras)
     times = [frame.t_us for frame in frames]
     log = scenario.ego_log.t_us
     assert times == list(range(int(log[0]) + FIRST_US, int(log[-1]), INTERVAL_US))
@@ -77,9 +77,10 @@ def test_a_recorded_frame_is_believed_where_registration_put_the_views_beside_it
     damage = Degradation("reconstruction", pose_error_m=0.1, views_per_s=12.0)
     scenario = street(damage)
     recipe = recipe_of(scenario)
-    (frame, *_) = built_recording(scenario, scene_of(scenario), scene_of(scenario).render, recipe)
     (camera,) = scenario.cameras
-    (view, *_) = logged_views(scenario, scene_of(scenario), recipe.splat.views, 32)
+    scene = scene_of(scenario)
+    (frame, *_) = built_recording(scenario, scene, scene.render, recipe, scenario.cameras)
+    (view, *_) = logged_views(scenario, scene, recipe.splat.views, 32)
     at_its_time = replace(view, t_us=frame.t_us)
     (moved,) = misplaced([at_its_time], recipe.pose_error_m, scenario.scene_id, recipe.splat.seed)
     true = inverse(interpolate(scenario.ego_log, frame.t_us) @ camera.T_rig_camera)
