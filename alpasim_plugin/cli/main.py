@@ -33,6 +33,7 @@ from alpasim_plugin.core.errors import (
     is_interruption,
 )
 from alpasim_plugin.core.files.places import damaged_kernels
+from alpasim_plugin.core.kept_threads import end_kept_threads
 from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.printing import (
     drop_unwritten,
@@ -508,6 +509,7 @@ def main() -> None:
     if _document_is_ours(sys.argv[1:]):
         keep_stdout_for_document()
     code = run_command(sys.argv[1:])
+    end_kept_threads()
     _leave_threads_behind(code)
     sys.exit(code)
 

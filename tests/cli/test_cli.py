@@ -1,6 +1,7 @@
 """The command line as a user meets it: exit codes, errors, JSON, dry runs."""
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -218,6 +219,22 @@ def test_policy_of_the_working_directory_is_found(tmp_path, monkeypatch, capsys)
         main()
     assert left.value.code == 0
     assert json.loads(capsys.readouterr().out)["policies"] == ["policy_of_this_folder:Mine"]
+
+
+def test_threads_that_are_kept_end_with_the_command():
+    program = """
+import atexit, sys
+from alpasim_plugin.cli.main import main
+from alpasim_plugin.core.kept_threads import kept_pool
+
+kept_pool(2).submit(len, "").result()
+atexit.register(print, "left in order")
+sys.argv = ["simrun", "--version"]
+main()
+"""
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert ended.stdout.splitlines()[-1] == "left in order"
 
 
 @pytest.mark.parametrize("kind", ["renderers", "policies", "scenarios", "metrics"])

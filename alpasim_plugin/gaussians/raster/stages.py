@@ -7,19 +7,18 @@ call; a forked process starts its own.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.kept_threads import kept_pool
 from alpasim_plugin.core.types import F32, F64, I64, FloatArray
 from alpasim_plugin.gaussians.camera import Posed
 from alpasim_plugin.gaussians.cloud import all_rigid, require_rigid
@@ -221,16 +220,7 @@ def _pool(threads: int) -> Iterator[ThreadPoolExecutor]:
     own, for the time of the block.
     """
     if threading.current_thread() is threading.main_thread():
-        yield _kept_pool(threads)
+        yield kept_pool(threads)
         return
     with ThreadPoolExecutor(threads) as pool:
         yield pool
-
-
-@lru_cache(maxsize=8)
-def _kept_pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="stages")
-
-
-# A forked process has the pools of its parent, but not their threads.
-os.register_at_fork(after_in_child=_kept_pool.cache_clear)
