@@ -39,7 +39,7 @@ TAPS = 2  # bicubic look-ups reach so many pixels beyond an image
 # Added to a place in pixels: OpenCV counts from the first pixel's middle, here of such a margin.
 FIRST_PX = TAPS - 0.5
 NOWHERE_PX = np.float32(-1e4)
-SAMPLED_PX = 8  # apart are the rays of a lens by which it is told where a box may be seen
+SAMPLED_PX = 8  # between the rays of a lens that are tested for whether a box can be seen
 # Validity, the last channel of a reference: the depths agree, or do not; 0 elsewhere.
 VALID = 255
 INCONSISTENT = 128

@@ -102,8 +102,8 @@ def row_of(
     parts = visible, inside & visible, visible & ~inside
     numbers = [f"{decibels(renders, held, part):.2f}" for part in parts]
     if images is not None:
-        shown = np.concatenate([held[1].rgb, renders[1]], axis=0)
-        cv2.imwrite(str(images / f"{name[:7]}-{way}.png"), shown[..., ::-1])
+        pair = np.concatenate([held[1].rgb, renders[1]], axis=0)
+        cv2.imwrite(str(images / f"{name[:7]}-{way}.png"), pair[..., ::-1])
     share = f"{parts[2].sum() / visible.sum():.2f}"
     return [name, way, *numbers, share, f"{seconds:.0f}"]
 
