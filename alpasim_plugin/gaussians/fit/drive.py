@@ -108,15 +108,11 @@ def fit_drive(
     if trial is not None:
         trial(trial_of(train, start, recipe, threads=threads, device=device))
 
-    def show(model: Reconstruction) -> None:
-        if preview is not None:
-            preview(FittedDrive(model, _exposures(train, model, kept or {})))
-
     model = fit(
         train,
         start,
         recipe,
-        look=Look(max(1, round(PREVIEW_SHARE * recipe.steps)), show),
+        look=_look_of(preview, train, kept or {}, recipe),
         scene_id=scene_id,
         folder=folder,
         threads=threads,
@@ -124,6 +120,24 @@ def fit_drive(
         report=lambda step, numbers: tell(FITTING, step, recipe.steps, numbers),
     )
     return FittedDrive(model, _exposures(train, model, kept or {}))
+
+
+def _look_of(
+    preview: Callable[[FittedDrive], None] | None,
+    train: Sequence[PosedView],
+    kept: Mapping[str, PinholeCamera | LensCamera],
+    recipe: SplatRecipe,
+) -> Look | None:
+    """Return when a fit shows the street to ``preview``; None where there is none, since a look
+    copies the model from its device.
+    """
+    if preview is None:
+        return None
+
+    def show(model: Reconstruction) -> None:
+        preview(FittedDrive(model, _exposures(train, model, kept)))
+
+    return Look(max(1, round(PREVIEW_SHARE * recipe.steps)), show)
 
 
 def _boxes_in_view(views: Sequence[PosedView], boxes: Mapping[str, Box]) -> dict[str, Box]:
