@@ -14,7 +14,7 @@ import numpy as np
 
 from alpasim_plugin.cameras.lens import projected
 from alpasim_plugin.core.devices import implementation, require_device
-from alpasim_plugin.core.errors import InputError
+from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files import content_of, read_json, read_json_object
 from alpasim_plugin.core.files.atomic import write_bytes, write_json, write_text
 from alpasim_plugin.core.files.images import PNG
@@ -316,15 +316,38 @@ def _write_preview(
     tell: Report,
 ) -> None:
     """Write a scenario of a street that is being fitted, and name it and an image of it. One of an
-    earlier import is replaced; anything else in its place stays.
+    earlier import is replaced; anything else in its place stays. What keeps a preview from being
+    written is said, and the fit goes on.
     """
     target = preview_folder(task.out)
-    if os.path.exists(target):
-        if not os.path.isfile(target / KEY_FILE):
-            tell(f"no preview is written: {target} is there", 0, 0)
-            return
-        shutil.rmtree(target)
+    if os.path.exists(target) and not os.path.isfile(target / KEY_FILE):
+        tell(f"no preview is written: {target} is there", 0, 0)
+        return
     tell("writing a preview", 0, 1)
+    try:
+        if os.path.exists(target):
+            shutil.rmtree(target)
+        _write_preview_folder(target, task, drive, placed, roads, street, photographs, views)
+    except (OSError, SimrunError) as error:
+        tell(f"no preview is written: {error}", 0, 0)
+        return
+    images = sorted((target / IMAGES).glob("*.jpg"))
+    look = f"look at {images[0]} (photograph above, street below), " if images else ""
+    drive_it = f"drive it with: simrun --renderer 3dgs {target / SCENARIO_FILE}"
+    tell(f"a quarter of the updates is done: {look}{drive_it}", 0, 0)
+
+
+def _write_preview_folder(
+    target: Path,
+    task: _Import,
+    drive: SourceDrive,
+    placed: PlacedDrive,
+    roads: LaneMap,
+    street: FittedDrive,
+    photographs: Sequence[PlacedPhotograph],
+    views: Mapping[str, Sequence[PosedView]],
+) -> None:
+    """Write the folder of a preview, whose photographs are those of the import."""
     with working_folder(target) as folder:
         begin(folder, f"preview of {task.key}")
         for photograph in photographs:
@@ -340,10 +363,6 @@ def _write_preview(
             street.exposures,
             lambda stage, done, all: None,
         )
-    images = sorted((target / IMAGES).glob("*.jpg"))
-    look = f"look at {images[0]} (photograph above, street below), " if images else ""
-    drive_it = f"drive it with: simrun --renderer 3dgs {target / SCENARIO_FILE}"
-    tell(f"a quarter of the updates is done: {look}{drive_it}", 0, 0)
 
 
 def _link(file: Path, other: Path) -> None:

@@ -140,6 +140,22 @@ def test_a_folder_in_the_place_of_a_preview_stays(tmp_path):
     assert said == [(f"no preview is written: {mine} is there", 0, 0)]
 
 
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left on device"), InputError("too thin", "take more")]
+)
+def test_an_import_goes_on_without_a_preview_that_cannot_be_written(tmp_path, monkeypatch, error):
+    def refuse(*given):
+        raise error
+
+    monkeypatch.setattr(build, "begin", refuse)
+    said = []
+    task = SimpleNamespace(out=tmp_path / "out", key="k")
+    build._write_preview(task, *[None] * 6, lambda *told: said.append(told))
+    assert said[0] == ("writing a preview", 0, 1)
+    assert said[1][0].startswith("no preview is written: ")
+    assert str(error) in said[1][0]
+
+
 @pytest.mark.slow
 def test_scale_without_metres_comes_from_the_cameras_height(tmp_path, quick_fit):
     folder = write_transforms(tmp_path / "walk")
