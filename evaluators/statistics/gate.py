@@ -348,14 +348,17 @@ def _limits(
     side: Side, variant: Variant, name: str, spec: GateSpec, metric_table: MetricTable
 ) -> list[Check]:
     """Test the means of a variant against the limits that the gate sets."""
-    rules = dict(spec.metrics)
-    if spec.max_beyond_measured is not None:
-        rules[BEYOND] = MetricRule(max=spec.max_beyond_measured)
-    return [
+    checks = [
         _limit(side, variant, name, metric_table.info(metric), rule, spec)
-        for metric, rule in rules.items()
+        for metric, rule in spec.metrics.items()
         if rule.max is not None or rule.min is not None
     ]
+    if spec.max_beyond_measured is not None:
+        rule = MetricRule(max=spec.max_beyond_measured)
+        # A rollout of which it is not known is never taken for one that stayed within.
+        strict = spec.model_copy(update={"max_missing": 0.0})
+        checks.append(_limit(side, variant, name, metric_table.info(BEYOND), rule, strict))
+    return checks
 
 
 def _sizes(

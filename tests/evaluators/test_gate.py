@@ -415,6 +415,10 @@ def test_a_gate_limits_how_much_lies_beyond_what_was_compared(shares, wanted):
     codes = (0, EXIT_CODES["regression"], EXIT_CODES["incomplete"])
     assert judged(with_beyond(shares), spec).exit_code == codes[wanted]
     assert judged(rows(), spec).exit_code == codes[2], "a run without the metric is no pass"
+    lenient = spec.model_copy(update={"max_missing": 0.9})
+    assert judged(with_beyond(shares), lenient).exit_code == codes[wanted], (
+        "where it is not known, nothing says that it lies within"
+    )
     rule = {"beyond_measured_share": MetricRule(max=0.1)}
     for fields in ({"metrics": rule}, {"boundary_margin": 0.1}):
         with pytest.raises(ValueError, match="max_beyond_measured"):
