@@ -405,6 +405,8 @@ def _plan_ranges(spec: ScenarioSpec, content_hash: str) -> tuple[PlanRange, ...]
             entry.policy,
             entry.near_to_m,
             is_current=content_hash.startswith(entry.scene.removeprefix("sha256-")),
+            renderer_digest=entry.renderer_digest,
+            policy_digest=entry.policy_digest,
         )
         for entry in spec.plan_ranges
     )

@@ -219,6 +219,14 @@ class PlanRangeSpec(Part):
         pattern=r"^sha256-[0-9a-f]{16}$",
         description="Digest of the scene on which it was looked for.",
     )
+    renderer_digest: str | None = Field(
+        pattern=r"^sha256-[0-9a-f]{16}$",
+        description="Digest of the renderer's code, settings and weights; null: of one elsewhere.",
+    )
+    policy_digest: str | None = Field(
+        pattern=r"^sha256-[0-9a-f]{16}$",
+        description="Digest of the policy's code, settings and weights; null: of one elsewhere.",
+    )
 
 
 Place = Annotated[str, Field(pattern=r"^.+:\d+(\.\d+)?$")]

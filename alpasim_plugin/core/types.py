@@ -534,6 +534,8 @@ class PlanRange:
     policy: str  # its name, as a run has it
     near_to_m: float | None  # to either side; None: not even on the path
     is_current: bool = True  # whether it was looked for on the scene as it is now
+    renderer_digest: str | None = None  # of the renderer with which it was looked for
+    policy_digest: str | None = None  # of the policy with which it was looked for
 
 
 @dataclass(frozen=True)

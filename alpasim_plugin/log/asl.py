@@ -170,6 +170,7 @@ def copy_log(
     target: Path,
     session_uuid: str = "",
     renderer: str = "",
+    renderer_digest: str = "",
     cameras: Mapping[str, str] = EMPTY,
 ) -> None:
     """Copy a log under other names.
@@ -179,6 +180,7 @@ def copy_log(
         target: The file to write; its folder exists.
         session_uuid: The new session id; empty keeps the log's.
         renderer: The new name of the renderer in the header; empty keeps the log's.
+        renderer_digest: The digest of the renderer that has the new name; empty where it has none.
         cameras: Old name -> new name; others keep theirs.
 
     Raises:
@@ -195,6 +197,7 @@ def copy_log(
                 owner.session_uuid = session_uuid
             if renderer and kind == "rollout_metadata":
                 message.version_ids.sensorsim_version.version_id = renderer
+                message.version_ids.sensorsim_version.git_hash = renderer_digest
             for holder, name in _names(kind, message):
                 old = getattr(holder, name)
                 if old in cameras:

@@ -34,7 +34,7 @@ ASL = Fields(
         "ActorAABB": "actor_id aabb actor_label",
         "VersionIds": """runtime_version egodriver_version sensorsim_version physics_version
             traffic_version controller_version video_model_version""",
-        "VersionId": "version_id",
+        "VersionId": "version_id git_hash",
         "ActorPoses": "timestamp_us actor_poses",
         "ActorPose": "actor_id actor_pose",
         "DriveRequest": "time_now_us time_query_us",
@@ -65,7 +65,7 @@ ASL = Fields(
             video_model_chunk_return batch_render_request""",
         "RolloutMetadata": "rollout_index",
         "SessionMetadata": "batch_size nre_runid nre_version nre_uuid",
-        "VersionId": "git_hash grpc_api_version",
+        "VersionId": "grpc_api_version",
         "DriveRequest": "session_uuid renderer_data",
         "DriveResponse.DebugInfo": "unstructured_debug_info",
         "RouteRequest": "session_uuid",

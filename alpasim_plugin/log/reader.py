@@ -65,6 +65,7 @@ def read_asl(path: Path | str, images: bool = True) -> RolloutLog:
         holds ``entries`` (count by kind), ``n_steps``, ``empty_plans`` and ``unanswered`` (drive
         requests without a plan), ``terminated`` (the driver ended the rollout), ``cameras``
         (`CameraSpec` of each with its lens), ``other_cameras`` (names of those that none states), ``versions``,
+        ``digests`` (of what a service is made of, by service),
         and ``undefined_actors`` (poses of ids that the header does not define are left out).
 
     Raises:
@@ -233,12 +234,17 @@ def _info(got: _Collected, metadata: logging_pb2.RolloutMetadata) -> dict[str, A
         member.name.removesuffix("_version"): version.version_id
         for member, version in metadata.version_ids.ListFields()
     }
+    digests = {
+        member.name.removesuffix("_version"): version.git_hash
+        for member, version in metadata.version_ids.ListFields()
+    }
     return {
         "entries": dict(got.counts),
         "n_steps": metadata.session_metadata.n_sim_steps,
         "unanswered": len(got.requests),
         "undefined_actors": tuple(sorted(set(got.poses) - defined)),
         "versions": versions,
+        "digests": digests,
         **got.info,
     }
 

@@ -86,6 +86,7 @@ class RolloutHeader:
         versions: Version text by service (``runtime``, ``egodriver``, ``sensorsim``,
             ``controller``, ``physics``, ``traffic``, ``video_model``); services not named are
             logged as skipped.
+        digests: Digest of a service's code, settings and weights, by service, where it has one.
     """
 
     scene_id: str
@@ -99,6 +100,7 @@ class RolloutHeader:
     n_steps: int
     seed: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def T_rig_box(self) -> F64:

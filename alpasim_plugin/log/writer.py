@@ -318,7 +318,8 @@ class AslWriter:
         version = self.header.versions.get(
             service, __version__ if service == "runtime" else "<skip>"
         )
-        git_hash = "<skip>" if version == "<skip>" else ""
+        digest = self.header.digests.get(service, "")
+        git_hash = "<skip>" if version == "<skip>" else digest
         return common_pb2.VersionId(
             version_id=version, git_hash=git_hash, grpc_api_version=api_version()
         )

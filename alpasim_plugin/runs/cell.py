@@ -8,7 +8,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, RendererSpec, build, complete
 from alpasim_plugin.core.parts.blame import last_called
 from alpasim_plugin.core.parts.patches import replaced_code
+from alpasim_plugin.core.parts.spec import short_digest
 from alpasim_plugin.core.subprocesses import parts_print_to_stderr
 from alpasim_plugin.core.types import Frame, RenderRequest, Scenario
 from alpasim_plugin.log.asl import copy_log
@@ -78,6 +79,7 @@ class RolloutParts:
         session: Identifies the rollout in its log; equal rollouts have equal ids.
         names: Name of each service, for the log's header.
         controller: Moves the ego.
+        digests: Digest of each service that has one, for the log's header.
     """
 
     renderer: Renderer
@@ -85,6 +87,7 @@ class RolloutParts:
     session: str
     names: Mapping[str, str]
     controller: Controller
+    digests: Mapping[str, str] = field(default_factory=dict)
 
 
 PartsBuilder = Callable[[Cell, RunOptions, Scenario, int], RolloutParts]
@@ -114,7 +117,14 @@ def build_parts(
         cell.rollout_key,
         {"sensorsim": _service_name(cell.renderer), "egodriver": cell.policy.name},
         build(cell.controller, vehicle=scenario.vehicle, scene_id=scenario.scene_id),
+        _digests_of(cell),
     )
+
+
+def _digests_of(cell: Cell) -> dict[str, str]:
+    """Return the digests of a cell's renderer and policy, without those that have none."""
+    sha256 = {"sensorsim": cell.renderer.digest, "egodriver": cell.policy.digest}
+    return {service: short_digest(text) for service, text in sha256.items() if text is not None}
 
 
 def _service_name(renderer: RendererSpec) -> str:
@@ -225,8 +235,13 @@ def copy_cell(
     source = root / original.path
     with _writing_manifest(cell, options, folder) as draft:
         session = session_uuid(cell.seed, cell.rollout_key)
-        name = _service_name(cell.renderer)
-        copy_log(source / LOG_NAME, folder / LOG_NAME, session, name)
+        copy_log(
+            source / LOG_NAME,
+            folder / LOG_NAME,
+            session,
+            renderer=_service_name(cell.renderer),
+            renderer_digest=_digests_of(cell).get("sensorsim", ""),
+        )
         for file in (FRAMES_NAME, DEBUG_NAME, OUTPUT_NAME):
             if os.path.exists(source / file):
                 shutil.copyfile(source / file, folder / file)
@@ -350,6 +365,7 @@ def _drive(
         options.images,
         options.video != "none",
         parts.names,
+        parts.digests,
     )
     policy = complete(parts.policy, Policy)
     controller = complete(parts.controller, Controller)

@@ -99,6 +99,7 @@ class Recorder:
         keep_frames: Keep the cameras' frames for a video.
         versions: Names of services for the log's header, such as ``{"sensorsim": "3dgs",
             "egodriver": "lane-camera"}``.
+        digests: Digest of each of these services that has one.
 
     Attributes:
         film: The frames that were kept.
@@ -113,6 +114,7 @@ class Recorder:
         images: Literal["none", "jpeg", "png"] = "jpeg",
         keep_frames: bool = False,
         versions: Mapping[str, str] | None = None,
+        digests: Mapping[str, str] | None = None,
     ) -> None:
         self._temporary = temporary_folder("simrun-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else folder or Path()
@@ -122,6 +124,7 @@ class Recorder:
         self._images = images
         self._keep_frames = keep_frames
         self._versions = dict(versions or {})
+        self._digests = dict(digests or {})
         self._times = StageTimes()
         self._frames: list[JsonObject] = []
         self._debug: list[JsonObject] = []
@@ -173,6 +176,7 @@ class Recorder:
             n_steps=clock.n_steps,
             seed=self._seed,
             versions=self._versions,
+            digests=self._digests,
         )
         self._writer = AslWriter(self.folder / LOG_NAME, header)
         self._writer.begin(list(cameras.values()))

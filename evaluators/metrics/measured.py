@@ -32,6 +32,11 @@ NOT_LOOKED_FOR = (
     "how far beside the path plans are near was not looked for with this renderer and policy"
 )
 OTHER_SCENE = "the scene is another one than that on which the range of its plans was looked for"
+OTHER_PARTS = (
+    "the code, settings or weights of the renderer or the policy are others than those with which "
+    "the range of its plans was looked for"
+)
+UNKNOWN = (NOT_LOOKED_FOR, OTHER_SCENE, OTHER_PARTS)  # why a drive has no share
 
 
 def evaluate_measured(
@@ -54,8 +59,8 @@ def evaluate_measured(
     if renderer == TRUTH:
         return [series(BEYOND, rollout.ego.t_us, 0.0)]
     entry = _range_of(scene.plan_ranges, renderer, policy)
-    if entry is None or not entry.is_current:
-        reason = NOT_LOOKED_FOR if entry is None else OTHER_SCENE
+    reason = _why_unknown(entry, rollout)
+    if entry is None or reason:
         return [series(BEYOND, rollout.ego.t_us, np.nan, False, reason)]
     if entry.near_to_m is None:
         return [series(BEYOND, rollout.ego.t_us, 1.0)]
@@ -90,6 +95,21 @@ def _range_of(ranges: tuple[PlanRange, ...], renderer: str, policy: str) -> Plan
         if (entry.renderer, entry.policy) == (renderer, policy):
             return entry
     return None
+
+
+def _why_unknown(entry: PlanRange | None, rollout: RolloutLog) -> str:
+    """Say why a range does not hold for a rollout; empty where it holds."""
+    if entry is None:
+        return NOT_LOOKED_FOR
+    if not entry.is_current:
+        return OTHER_SCENE
+    digests = rollout.info.get("digests", {})
+    looked_with = {"sensorsim": entry.renderer_digest, "egodriver": entry.policy_digest}
+    # A part without a digest, such as one on a server, is known by its name alone.
+    has_same_parts = all(
+        digest is None or digests.get(service) == digest for service, digest in looked_with.items()
+    )
+    return "" if has_same_parts else OTHER_PARTS
 
 
 def _turns_deg(path: Trajectory, line: F64, along_m: F64, ego: Trajectory) -> F64:

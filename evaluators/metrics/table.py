@@ -579,7 +579,7 @@ METRICS = MetricTable(
             label="steps beyond what was compared",
             margin=0.05,
             reference=CENTRE,
-            invalid="the scene is built, and its `plan_ranges` do not name the renderer and the policy or are of another scene; without `plan_ranges` there is no row",
+            invalid="the scene is built, and its `plan_ranges` do not name the renderer and the policy, or are of another scene or of other code or weights; without `plan_ranges` there is no row",
             formula="1 where `c` is farther from `P` than the farthest camera whose photographs no fit saw, of a built scene than its `plan_ranges` say (at least 0.25 m), or the heading differs by more than that camera's axis does (at least 5 degrees)",
         ),
         "safety_monitor_triggered": _flag(

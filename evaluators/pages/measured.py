@@ -2,7 +2,7 @@
 
 from alpasim_plugin.core.json_types import JsonView
 from alpasim_plugin.log.run_folder.rows import Rollout
-from evaluators.metrics.measured import BEYOND, NOT_LOOKED_FOR, ON_PATH_M, OTHER_SCENE
+from evaluators.metrics.measured import BEYOND, ON_PATH_M, UNKNOWN
 from evaluators.statistics.numbers import plural
 from evaluators.statistics.opening import Run
 from evaluators.statistics.sentences import beyond_reason
@@ -22,7 +22,7 @@ def measured_cautions(run: Run) -> list[str]:
         censoring = run.summary.censoring.get(variant)
         invalid = None if censoring is None else censoring.invalid.get(BEYOND)
         for reason, rollouts in ({} if invalid is None else invalid.reasons).items():
-            if reason in (NOT_LOOKED_FOR, OTHER_SCENE):
+            if reason in UNKNOWN:
                 cautions.append(f"{variant}, {plural(rollouts, 'rollout')}: {reason}.")
     return cautions
 

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from alpasim_plugin.core.types import MeasuredRange, PlanRange
-from evaluators.metrics.measured import NOT_LOOKED_FOR, OTHER_SCENE
+from evaluators.metrics.measured import NOT_LOOKED_FOR, OTHER_PARTS, OTHER_SCENE
 from evaluators.metrics.score import score
 from evaluators.pages.measured import measured_cautions
 from evaluators.statistics.cause import beyond_sentences
@@ -80,10 +80,9 @@ def looked_for(near_to_m, **others):
     return PlanRange("onefixer", "p", near_to_m, **others)
 
 
-def on_built(ego, entry, renderer="onefixer (trained, 1a2b)", preset="strict"):
-    log = replace(
-        rollout(ego, log=PATH), info={"versions": {"sensorsim": renderer, "egodriver": "p"}}
-    )
+def on_built(ego, entry, renderer="onefixer (trained, 1a2b)", preset="strict", digests=None):
+    info = {"versions": {"sensorsim": renderer, "egodriver": "p"}, "digests": digests or {}}
+    log = replace(rollout(ego, log=PATH), info=info)
     where = replace(scene(TWO_LANES, log), plan_ranges=(entry,))
     return by_name(score(log, where, preset)).get(NAME)
 
@@ -115,6 +114,22 @@ def test_a_range_that_is_not_known_is_no_zero(entry, renderer, reason):
     assert not series.valid.any()
     assert np.isnan(series.value).all()
     assert series.reason == reason
+
+
+@pytest.mark.parametrize("service", ["sensorsim", "egodriver"])
+def test_a_range_does_not_hold_for_other_weights(service):
+    digests = {"sensorsim": "sha256-1", "egodriver": "sha256-2"}
+    entry = looked_for(0.5, renderer_digest="sha256-1", policy_digest="sha256-2")
+    assert on_built(PATH, entry, digests=digests).valid.all()
+    for other in ({**digests, service: "sha256-3"}, {**digests, service: ""}, {}):
+        series = on_built(PATH, entry, digests=other)
+        assert not series.valid.any()
+        assert series.reason == OTHER_PARTS
+
+
+def test_a_part_without_a_digest_is_known_by_its_name():
+    entry = looked_for(0.5, renderer_digest=None, policy_digest=None)
+    assert on_built(PATH, entry, digests={"sensorsim": "of its own server"}).valid.all()
 
 
 def test_a_log_that_does_not_name_its_renderer_has_no_range():

@@ -10,7 +10,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.interfaces import Renderer, complete
+from alpasim_plugin.core.parts.spec import short_digest
 from alpasim_plugin.core.types import Frame, SensorSpec
+from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.images import decode_image
 from alpasim_plugin.log.run_folder.check import inspect_run
 from alpasim_plugin.log.run_folder.manifests import read_manifest
@@ -93,6 +95,12 @@ def test_a_copy_is_the_rollout_that_driving_would_have_made(tmp_path):
         for name in ("rollout.asl", "frames.jsonl", "steps.parquet"):
             one, other = (tmp_path / where / cell.folder / name for where in ("run", "alone"))
             assert one.read_bytes() == other.read_bytes()
+        assert read_asl(tmp_path / "run" / cell.folder / "rollout.asl").info["digests"] == {
+            "runtime": "",
+            "sensorsim": short_digest(cell.renderer.digest),
+            "egodriver": short_digest(cell.policy.digest),
+            **dict.fromkeys(("physics", "traffic", "controller", "video_model"), "<skip>"),
+        }
     rows = pq.read_table(tmp_path / "run" / "rollouts.parquet").to_pylist()
     assert [row["copied_from"] is not None for row in rows] == [False, True] * 2
 

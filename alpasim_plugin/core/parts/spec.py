@@ -154,6 +154,14 @@ def _restored(target: str, pickled_fields: bytes) -> PartSpec:
     return PartSpec(**pickle.loads(pickled_fields))
 
 
+SHORT_DIGEST = 16  # letters
+
+
+def short_digest(sha256: str) -> str:
+    """Return a digest as files and logs that people read name it: ``sha256-`` and its first letters."""
+    return f"sha256-{sha256[:SHORT_DIGEST]}"
+
+
 def digest(value: object) -> str:
     """Return a SHA-256 over the canonical JSON of a value."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

@@ -160,7 +160,8 @@ def real(
         gaps += bench.measure_built(name, scenario, offsets_m)
     ranges = gap_ranges(gaps) if find_range else []
     if out is not None:
-        write_ranges(out, drives[0], built[next(iter(built))], ranges, gaps)
+        (scenario,) = built.values()
+        write_ranges(out, drives[0], scenario, ranges, gaps, bench.renderers, bench.policies)
         console.print(f"wrote {out}", highlight=False)
     _say(images, gaps, ranges, len(scenarios), as_json, console)
 

@@ -13,12 +13,12 @@ from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files.atomic import write_text
 from alpasim_plugin.core.files.places import temporary_folder
 from alpasim_plugin.core.files.reading import real
+from alpasim_plugin.core.parts.resolve import RendererSpec
+from alpasim_plugin.core.parts.spec import PartSpec, short_digest
 from alpasim_plugin.core.types import Scenario
 from scenarios.load import load_scenario
 from scenarios.sources import open_document
 from scenarios.suite import find
-
-DIGEST = 16  # letters of a scene's digest that the file keeps
 
 
 def check_target(out: Path, drives: Sequence[Path], find_range: bool) -> None:
@@ -43,6 +43,8 @@ def write_ranges(
     scenario: Scenario,
     ranges: Sequence[Mapping[str, Any]],
     gaps: Sequence[Mapping[str, Any]],
+    renderers: Mapping[str, RendererSpec],
+    policies: Sequence[PartSpec],
 ) -> None:
     """Write a scenario file that is the scene with `plan_ranges`.
 
@@ -52,6 +54,8 @@ def write_ranges(
         scenario: The scene.
         ranges: Of `gap_ranges`.
         gaps: Of `gap_rows`, from which they were made.
+        renderers: With which the ranges were looked for.
+        policies: With which the ranges were looked for.
 
     Raises:
         InputError: The plans of a policy are too short to be compared.
@@ -72,14 +76,23 @@ def write_ranges(
     with temporary_folder("simrun-") as folder:
         plain = Path(folder) / out.name
         write_text(plain, yaml.safe_dump(content))
-        digest = load_scenario(str(plain)).content_hash[:DIGEST]
+        digest = short_digest(load_scenario(str(plain)).content_hash)
+    parts: list[RendererSpec | PartSpec] = [*renderers.values(), *policies]
+    digests = {part.name: _digest_of(part) for part in parts}
     content["plan_ranges"] = [
         {
             "renderer": row["renderer"],
             "policy": row["policy"],
             "near_to_m": row["near_to_m"],
-            "scene": f"sha256-{digest}",
+            "scene": digest,
+            "renderer_digest": digests[row["renderer"]],
+            "policy_digest": digests[row["policy"]],
         }
         for row in ranges
     ]
     write_text(out, yaml.safe_dump(content, sort_keys=False))
+
+
+def _digest_of(spec: RendererSpec | PartSpec) -> str | None:
+    """Return the digest of a part; None where what it does is decided elsewhere."""
+    return None if spec.digest is None else short_digest(spec.digest)

@@ -13,7 +13,8 @@ import pytest
 from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.parts import resolve
+from alpasim_plugin.core.parts import resolve, resolve_renderer
+from alpasim_plugin.core.parts.spec import short_digest
 from alpasim_plugin.core.types import CameraSpec, Plan, PlanRange, SensorSpec
 from alpasim_plugin.lab.bench.drawn_series import drawn_series, offset_requests
 from alpasim_plugin.lab.bench.open_loop import TrueImage, plans_of, roles_of
@@ -366,23 +367,29 @@ def test_a_range_is_written_into_a_scene_and_holds_for_this_scene_alone(tmp_path
     scene = Path("smoke/curve")
     scenario = load_scenario(str(scene))
     out = tmp_path / "street.yaml"
-    ranges = [{"renderer": "3dgs", "policy": "p", "near_to_m": near} for near in (0.5,)]
-    write_ranges(out, scene, scenario, ranges, [])
+    ranges = [{"renderer": "3dgs", "policy": "lane-camera", "near_to_m": 0.5}]
+    renderers = {"3dgs": resolve_renderer("3dgs")}
+    policies = [resolve("policy", "lane-camera")]
+    write_ranges(out, scene, scenario, ranges, [], renderers, policies)
     written = load_scenario(str(out))
     assert written.scene_id == scenario.scene_id
-    assert written.scene.plan_ranges == (PlanRange("3dgs", "p", 0.5, is_current=True),)
+    looked_with = [short_digest(spec.digest) for spec in (renderers["3dgs"], policies[0])]
+    entry = PlanRange("3dgs", "lane-camera", 0.5, True, *looked_with)
+    assert written.scene.plan_ranges == (entry,)
     assert written.content_hash != scenario.content_hash, "scores of before are not taken for its"
     (other,) = load_scenario(str(out), overrides=["degradation.share=0.07"]).plan_ranges
     assert not other.is_current
+    gaps = [offset_row(0.0, None)]
     with pytest.raises(InputError, match="end before two seconds"):
-        write_ranges(tmp_path / "b.yaml", scene, scenario, ranges, [offset_row(0.0, None)])
+        write_ranges(tmp_path / "b.yaml", scene, scenario, ranges, gaps, renderers, policies)
     for arguments in ((out, [scene], True), (tmp_path / "c.yaml", [scene], False)):
         with pytest.raises(InputError):
             check_target(*arguments)
 
 
 def test_a_range_of_a_pair_is_given_once(tmp_path):
-    entry = "{renderer: 3dgs, policy: p, near_to_m: 0.5, scene: sha256-0123456789012345}"
+    digests = "renderer_digest: null, policy_digest: null, scene: sha256-0123456789012345"
+    entry = f"{{renderer: 3dgs, policy: p, near_to_m: 0.5, {digests}}}"
     with pytest.raises(InputError, match="twice"):
         load_scenario("smoke/curve", overrides=[f"plan_ranges=[{entry}, {entry}]"])
 
