@@ -2,11 +2,12 @@
 with how far the policy drives from where it drove behind `clean`.
 
 Usage: python docs/scripts/plan_gap_correlation.py SCENES OUT [--scenes N] [--seed N]
-       [--policy P,P] [--renderer R,R] [--json]
+       [--policy P,P] [--renderer R,R] [--set KEY=VALUE]... [--json]
 
 SCENES is a folder with the frozen splits (`simrun train scenes`). Scenes are taken in an order that is
 drawn with the seed, so that any number of them is a random part of all; each scene has a file of its
-own in OUT, and the same command continues where it stopped.
+own in OUT, and the same command continues where it stopped. ``--set`` changes every scene: with
+``--set "cameras={rig: surround-6}"`` it has the cameras that `learned-three` needs.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def measured(
             )
         rows: list[dict[str, Any]] = stored["rows"]
         return rows
-    scenario = load_scenario(file)
+    scenario = load_scenario(file, overrides=settings["set"])
     makers = {
         name: partial(make_renderer, spec, scenario, settings["seed"])
         for name, spec in specs.items()
@@ -82,6 +83,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--policy", default=POLICIES)
     parser.add_argument("--renderer", default=RENDERERS)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     files = drawn_order(options.scenes_folder, options.seed)
@@ -93,6 +95,7 @@ def main() -> None:
         "seed": options.seed,
         "policies": options.policy.split(","),
         "renderers": names,
+        "set": options.set,
         "has_jod": vdp is not None,
     }
     options.out.mkdir(parents=True, exist_ok=True)
