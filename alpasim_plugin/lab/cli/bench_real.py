@@ -70,61 +70,70 @@ TRUTH = "clean"  # of a built scene
 KEY_OF_TRUTH = "the truth"  # no name of a renderer
 
 
+Drives = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Folders of imported drives, or built scenes: scenario files, names and logs."
+    ),
+]
+Renderers = Annotated[str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")]
+Policies = Annotated[
+    str,
+    typer.Option(
+        "--policy",
+        help="Comma-separated policies: how far their plans move when they see the renderer in place of the photograph.",
+    ),
+]
+OffsetsText = Annotated[
+    str,
+    typer.Option(
+        "--offsets",
+        metavar="M,M...",
+        help="Metres to the left of the path, for built scenes, whose truth is clean; by default 0.",
+    ),
+]
+FindRange = Annotated[
+    bool,
+    typer.Option(
+        "--range",
+        help="Of built scenes: offsets of 0.25 m to both sides, up to where the plans' gap passes 0.3 m after two seconds.",
+    ),
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "-o",
+        "--out",
+        metavar="FILE.yaml",
+        help="With --range: write the scene with its range; a run on it counts the steps beyond.",
+    ),
+]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, help="Seed of the noise of fixers and policies.")
+]
+Device = Annotated[
+    Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")
+]
+Threads = Annotated[
+    int | None,
+    typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
+
+
 def real(
-    drives: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Folders of imported drives, or built scenes: scenario files, names and logs."
-        ),
-    ],
-    renderers: Annotated[
-        str, typer.Option("--renderer", help="Comma-separated renderers and fixers.")
-    ] = "3dgs,onefixer",
-    policies: Annotated[
-        str,
-        typer.Option(
-            "--policy",
-            help="Comma-separated policies: how far their plans move when they see the renderer in place of the photograph.",
-        ),
-    ] = "",
-    offsets: Annotated[
-        str,
-        typer.Option(
-            "--offsets",
-            metavar="M,M...",
-            help="Metres to the left of the path, for built scenes, whose truth is clean; by default 0.",
-        ),
-    ] = "",
-    find_range: Annotated[
-        bool,
-        typer.Option(
-            "--range",
-            help="Of built scenes: offsets of 0.25 m to both sides, up to where the plans' gap passes 0.3 m after two seconds.",
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="FILE.yaml",
-            help="With --range: write the scene with its range; a run on it counts the steps beyond.",
-        ),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Seed of the noise of fixers and policies.")
-    ] = 0,
-    device: Annotated[
-        Literal["cpu", "cuda"], typer.Option("--device", help="Where to render and to fix.")
-    ] = "cpu",
-    threads: Annotated[
-        int | None,
-        typer.Option("--threads", min=1, help="Threads of the rasteriser; by default all cores."),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document on stdout.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    drives: Drives,
+    renderers: Renderers = "3dgs,onefixer",
+    policies: Policies = "",
+    offsets: OffsetsText = "",
+    find_range: FindRange = False,
+    out: Out = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    threads: Threads = None,
+    as_json: AsJson = False,
+    debug: Debug = False,
 ) -> None:
     """Compare renderers with photographs that no fit saw: on the recorded path, and beside it with
     a second camera.
