@@ -3,6 +3,9 @@ is on the road and clear of all.
 """
 
 from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -17,6 +20,7 @@ from alpasim_plugin.core.geometry import (
     rectangle_corners,
 )
 from alpasim_plugin.core.lane_areas import lane_polygon
+from alpasim_plugin.core.parts.spec import digest
 from alpasim_plugin.core.path_end import PathTracker, remaining
 from alpasim_plugin.core.types import F64, I64, Actor, Box, LaneMap, Route, Trajectory, Vehicle
 from alpasim_plugin.world.ground import flat
@@ -51,10 +55,23 @@ JOINT_M = 2.0  # behind the road's end, where a straight begins to be free
 STRIP_M = 6.0  # to either side, in which a straight is free
 STEP_M = 4.0  # what a fast car moves from one control step to the next
 TRACKED_EVERY = 20  # poses of the log
+KEPT_DRIVES = 64  # as many as the largest suite that is shipped has scenes, and some
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What a drive is built of; its digest stands for all of it."""
+
+    digest: str
+    draft: SceneDraft = field(compare=False)
+    vehicle: Vehicle = field(compare=False)
 
 
 def built_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     """Build the road, place the actors and let the expert drive.
+
+    A drive depends on the specification, the scene's id and the vehicle alone, no file among them,
+    so each of the last `KEPT_DRIVES` is built once a process; every call returns a copy.
 
     Args:
         draft: Specification with ``road``.
@@ -63,6 +80,16 @@ def built_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     Raises:
         InputError: A road, an actor or a drive that cannot be built, with the position of its key.
     """
+    made_of = [draft.scene_id, draft.spec.model_dump(mode="json"), asdict(vehicle)]
+    return deepcopy(_kept_drive(_Request(digest(made_of), draft, vehicle)))
+
+
+@lru_cache(maxsize=KEPT_DRIVES)
+def _kept_drive(request: _Request) -> RecordedLog:
+    return _new_drive(request.draft, request.vehicle)
+
+
+def _new_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     spec = draft.spec
     assert spec.road is not None
     written_m = sum(getattr(segment, "length_m", 0.0) for segment in spec.road.segments)
