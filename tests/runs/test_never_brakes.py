@@ -18,7 +18,7 @@ BRAKES = {
     "ego.cruise_mps": 11,
 }
 DRIVE = ["--renderer", "clean", "--policy", "constant-velocity", "--images", "none"]
-ALONE = ["--workers", "1", "--quiet", "--no-report"]
+ALONE = ["--workers", "1", "--quiet", "--no-report", "--video", "none"]
 ENDS_MPS = (0, 4)
 
 
