@@ -8,7 +8,14 @@ import numpy as np
 
 from alpasim_plugin.core.geometry import interpolate, inverse, yaw_of
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import Observation, Plan, Route, Scenario, SensorSpec
+from alpasim_plugin.core.types import (
+    Observation,
+    Plan,
+    Route,
+    Scenario,
+    SensorSpec,
+    Trajectory,
+)
 from policies.base import (
     MIN_CRUISE_MPS,
     curve_speeds,
@@ -47,14 +54,15 @@ class LogReplay(Policy):
     log.
 
     It knows the scenario's ego log, so it is a reference and not a policy under test. Where the log
-    ends before the horizon the plan ends there as well.
+    ends before the horizon the plan ends there as well, except where the scene goes on behind the
+    log: there the plan keeps the last speed of the log, straight on, past the goal.
     """
 
     sensors: Sequence[SensorSpec] = ()
     controller = "perfect"
 
     def __init__(self, scenario: Scenario) -> None:
-        self.log = scenario.ego_log
+        self.log = _carried_on(scenario.ego_log, scenario.drive_until_us)
 
     def reset(self, seed: int, route: Route) -> None:
         """Do nothing: the plan depends on the time alone."""
@@ -73,6 +81,22 @@ class LogReplay(Policy):
         in_rig = inverse(observation.ego.T_world_rig) @ interpolate(self.log, times)
         yaw = np.array([yaw_of(pose) for pose in in_rig])
         return Plan(now, times, in_rig[:, :2, 3].copy(), yaw)
+
+
+def _carried_on(log: Trajectory, until_us: int) -> Trajectory:
+    """Return a log that keeps its last speed, straight on, up to a time; the log itself where it does
+    not end before.
+    """
+    more_us = until_us - int(log.t_us[-1])
+    if more_us <= 0 or len(log) < 2:
+        return log
+    step_share = more_us / int(log.t_us[-1] - log.t_us[-2])
+    last = log.xyz[-1] + step_share * (log.xyz[-1] - log.xyz[-2])
+    return Trajectory(
+        np.append(log.t_us, until_us),
+        np.concatenate([log.xyz, last[None]]),
+        np.concatenate([log.quat, log.quat[-1:]]),
+    )
 
 
 class PurePursuit(Policy):

@@ -5,7 +5,7 @@ will enter the corridor within the next seconds (`yielding_acceleration`) and yi
 smoothly. Bends limit the speed; acceleration and jerk are bounded.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,6 +133,7 @@ def drive(
     end_us: int,
     lane_map: LaneMap | None = None,
     posted_mps: F64 | None = None,
+    traffic_until_us: Callable[[int], int] | None = None,
 ) -> tuple[Trajectory, tuple[Actor, ...]]:
     """Drive from time 0 to ``end_us``, or to the end of the path.
 
@@ -146,35 +147,33 @@ def drive(
         end_us: Last time.
         lane_map: Traffic lights at which all stop, and lines at which all let others pass.
         posted_mps: Speed limit at each vertex of the path.
+        traffic_until_us: Up to when the followers drive on, without the ego, after it has come to
+            the end of the path before ``end_us``, from the time at which it has; None: no longer.
 
     Returns:
         The ego's log (rig poses), and the followers as they drove.
     """
-    table = ScriptedTracks(scripts, end_us)
+    last_us = end_us if traffic_until_us is None else max(end_us, traffic_until_us(end_us))
+    table = ScriptedTracks(scripts, last_us)
     expert = _Expert(path, s0_m, vehicle, ego, table, *_lines_on(path, lane_map), posted_mps)
-    cars = [_Car(follower, *_lines_on(follower.path, lane_map)) for follower in followers]
-    lines = Lines([follower.path for follower in followers]) if cars else None
+    traffic = _Traffic(followers, lane_map, table)
     log_s = [expert.s]
-    for t in range(0, end_us, DECISION_US):
-        ahead = _predicted(table, cars, lines, t)
-        moving = ahead.now()
-        target = expert.decide(moving, ahead, t)
-        if lines is not None:
-            everybody = concatenate([table.standing, expert.bodies(), moving])
-            driving = ahead.present[0, len(table.boxes) :]
-            _let_followers_decide(cars, lines, everybody, driving, t)
+    t_us = 0
+    while t_us < end_us and not (t_us and expert.has_arrived):
+        ahead = traffic.predicted(t_us)
+        target = expert.decide(ahead.now(), ahead, t_us)
+        traffic.step(ahead, expert.bodies(), t_us)
         for _ in range(DECISION_US // LOG_STEP_US):
             expert.advance(target, LOG_STEP_US * 1e-6)
             log_s.append(expert.s)
-        for car in cars:
-            car.advance(DECISION_US * 1e-6)
-        if expert.front_s + 1.0 > path.length_m:
-            break
-    t_us = LOG_STEP_US * np.arange(len(log_s), dtype=np.int64)
-    keep = t_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
+        t_us += DECISION_US
+    if traffic_until_us is not None and t_us < end_us:
+        for beyond_us in range(t_us, traffic_until_us(t_us), DECISION_US):
+            traffic.step(traffic.predicted(beyond_us), None, beyond_us)
+    log_us = LOG_STEP_US * np.arange(len(log_s), dtype=np.int64)
+    keep = log_us < end_us + LOG_STEP_US  # the first pose at or after the end is the last
     xyz, yaw = path.at(np.array(log_s)[keep])
-    ego_log = Trajectory(t_us[keep], xyz, quat_from_yaw(yaw))
-    return ego_log, tuple(car.driven(t_us[:: DECISION_US // LOG_STEP_US]) for car in cars)
+    return Trajectory(log_us[keep], xyz, quat_from_yaw(yaw)), traffic.driven()
 
 
 def _lines_on(
@@ -216,6 +215,11 @@ class _Expert:
     @property
     def front_s(self) -> float:
         return self.s + self.front_m
+
+    @property
+    def has_arrived(self) -> bool:
+        """Tell whether it is at the end of its path."""
+        return self.front_s + 1.0 > self.path.length_m
 
     def bodies(self) -> Bodies:
         xyz, yaw = self.path.at(self.s)
@@ -293,12 +297,81 @@ class _Car:
         self.s, self.v = moved_on(self.s, self.v, self.a, dt_s)
         self.log_s.append(self.s)
 
-    def driven(self, times: I64) -> Actor:
+    def driven(self) -> Actor:
         """Return the road user with the track that it drove."""
-        s_m = np.array(self.log_s[: len(times)])
+        s_m = np.array(self.log_s)
+        t_us = DECISION_US * np.arange(len(s_m), dtype=np.int64)
         f = self.f
-        track = track_on_path(f.path, times, s_m, f.box, f.offset_m)
+        track = track_on_path(f.path, t_us, s_m, f.box, f.offset_m)
         return Actor(f.actor_id, f.label, f.box, track, behaviour=Behaviour("idm", f.params))
+
+
+class _Traffic:
+    """The followers while they drive, beside those who follow written tracks."""
+
+    def __init__(
+        self, followers: Sequence[Follower], lane_map: LaneMap | None, table: ScriptedTracks
+    ) -> None:
+        self.table = table
+        self.cars = [_Car(follower, *_lines_on(follower.path, lane_map)) for follower in followers]
+        self.lines = Lines([follower.path for follower in followers]) if followers else None
+
+    def step(self, ahead: PredictedBodies, ego: Bodies | None, t_us: int) -> None:
+        """Let the followers drive on for `DECISION_US`.
+
+        Args:
+            ahead: As `predicted` says.
+            ego: The ego where it takes part in the traffic.
+            t_us: Now.
+        """
+        if self.lines is None:
+            return
+        beside = [self.table.standing] if ego is None else [self.table.standing, ego]
+        everybody = concatenate([*beside, ahead.now()])
+        driving = ahead.present[0, len(self.table.boxes) :]
+        _let_followers_decide(self.cars, self.lines, everybody, driving, t_us)
+        for car in self.cars:
+            car.advance(DECISION_US * 1e-6)
+
+    def driven(self) -> tuple[Actor, ...]:
+        """Return the followers with the tracks that they drove."""
+        return tuple(car.driven() for car in self.cars)
+
+    def predicted(self, t_us: int) -> PredictedBodies:
+        """Return scripted tracks as they are written, and reactive cars at their present speed on
+        their own lines.
+        """
+        table = self.table
+        rows = table.rows(t_us)
+        xy = [table.xy[rows]]
+        yaw = [table.yaw[rows]]
+        velocity = [table.velocity[rows]]
+        present = [table.present[rows]]
+        z = [table.z[rows]]
+        cars = self.cars
+        if self.lines is not None:
+            s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
+            stations = s + v * TIMES_S[:, None]  # (1 + n, K)
+            line = np.broadcast_to(np.arange(len(cars)), stations.shape)
+            points, heading = self.lines.at(
+                line.ravel(), stations.ravel(), np.broadcast_to(offset, stations.shape).ravel()
+            )
+            heading = heading.reshape(stations.shape)
+            xy.append(points[:, :2].reshape(*stations.shape, 2))
+            yaw.append(heading)
+            velocity.append(v[:, None] * direction_of(heading))
+            present.append(stations <= self.lines.length_m)
+            half_m = np.array([car.f.box.height_m / 2 for car in cars])
+            z.append(points[:, 2].reshape(stations.shape) + half_m)
+        return PredictedBodies(
+            np.concatenate(xy, axis=1),
+            np.concatenate(yaw, axis=1),
+            np.concatenate(velocity, axis=1),
+            np.concatenate(present, axis=1),
+            (*table.boxes, *(car.f.box for car in cars)),
+            np.concatenate(z, axis=1),
+            np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
+        )
 
 
 def _let_followers_decide(
@@ -328,40 +401,3 @@ def _let_followers_decide(
     )
     for car, leader, row in zip(cars, leaders, row_of_car.tolist(), strict=True):
         car.decide(leader, everybody, row, t_us)
-
-
-def _predicted(
-    table: ScriptedTracks, cars: Sequence[_Car], lines: Lines | None, t_us: int
-) -> PredictedBodies:
-    """Return scripted tracks as they are written, and reactive cars at their present speed on their
-    own lines.
-    """
-    rows = table.rows(t_us)
-    xy = [table.xy[rows]]
-    yaw = [table.yaw[rows]]
-    velocity = [table.velocity[rows]]
-    present = [table.present[rows]]
-    z = [table.z[rows]]
-    if lines is not None:
-        s, v, offset = np.array([(car.s, car.v, car.f.offset_m) for car in cars]).T
-        stations = s + v * TIMES_S[:, None]  # (1 + n, K)
-        line = np.broadcast_to(np.arange(len(cars)), stations.shape)
-        points, heading = lines.at(
-            line.ravel(), stations.ravel(), np.broadcast_to(offset, stations.shape).ravel()
-        )
-        heading = heading.reshape(stations.shape)
-        xy.append(points[:, :2].reshape(*stations.shape, 2))
-        yaw.append(heading)
-        velocity.append(v[:, None] * direction_of(heading))
-        present.append(stations <= lines.length_m)
-        half_m = np.array([car.f.box.height_m / 2 for car in cars])
-        z.append(points[:, 2].reshape(stations.shape) + half_m)
-    return PredictedBodies(
-        np.concatenate(xy, axis=1),
-        np.concatenate(yaw, axis=1),
-        np.concatenate(velocity, axis=1),
-        np.concatenate(present, axis=1),
-        (*table.boxes, *(car.f.box for car in cars)),
-        np.concatenate(z, axis=1),
-        np.arange(len(table.boxes) + len(cars)) >= len(table.boxes),
-    )

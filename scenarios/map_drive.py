@@ -6,7 +6,8 @@ Only the part of the map around the route enters the scene.
 import difflib
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import shapely
@@ -47,6 +48,8 @@ AROUND_M = 130.0  # lanes that come this near to the route are part of the scene
 DRIVEN_GAP_M = 1.0  # links across wider gaps are not driven
 LONGEST_S = 300.0  # of a drive on a short route
 LONGEST_SHARE = 3.0  # of the time that a long route takes at the cruising speed
+SLOWER_SHARE = 1.5  # of the expert's time, which a policy may take
+LEAST_WAIT_S = 30.0  # beyond that; where a light of the route has a longer cycle, one cycle
 MOST_INSIDE_M = 0.6  # in bends: from the middle of the lane
 EASED_M = 1.5  # length over which that offset is smoothed
 YELLOW_AHEAD_S = 4.0  # before the ego, on a free road, would pass the first light of its route
@@ -82,7 +85,8 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
     driven = _inside_bends(
         Path(line.s[keep], line.xyz[keep], line.yaw[keep], line.curvature[keep]), front_m
     )
-    followers, walkers = _traffic(draft, spec.map, lane_map, way, line, driven, front_m)
+    limits = _TimeLimits.of(draft, driven, lane_map)
+    followers, walkers = _traffic(draft, spec.map, lane_map, way, line, driven, front_m, limits)
     ego_log, vehicles = drive(
         driven,
         0.0,
@@ -90,10 +94,13 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         spec.ego,
         walkers,
         followers,
-        _end_us(draft, driven.length_m),
+        limits.expert_us,
         lane_map,
         graph.limits_mps(way, driven),
+        limits.of_scene_us,
     )
+    arrived_us = int(ego_log.t_us[-1])
+    has_arrived = arrived_us < limits.expert_us
     return RecordedLog(
         draft.scene_id,
         spec.map.source[0],
@@ -109,6 +116,7 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         route=Route(line.xyz[::4], way.lane_ids),
         path_beyond=_up_to_goal(driven, driven.length_m - front_m - 1.0, ego_log.xyz),
         path_end="goal",
+        goes_on_until_us=limits.of_scene_us(arrived_us) if has_arrived else None,
     )
 
 
@@ -119,15 +127,43 @@ def _read_street(draft: SceneDraft, spec: MapSpec, files: SourceFiles) -> Street
         return READERS[kind](files, path)
 
 
-def _end_us(draft: SceneDraft, route_m: float) -> int:
-    """Return the last time of the drive: the duration that the file states, or the longest that a
-    route of so many metres may take.
+@dataclass(frozen=True)
+class _TimeLimits:
+    """How long a drive on a route may take.
+
+    Attributes:
+        expert_us: Last time of the expert's drive.
+        stated_us: Last time of the scene as the file states it; None: by the expert's arrival.
+        wait_us: What a slower drive may wait in addition.
     """
-    timing = draft.spec.timing
-    if timing.duration_us is None:
-        free_drive_s = route_m / draft.spec.ego.cruise_mps
-        return round(max(LONGEST_S, LONGEST_SHARE * free_drive_s) * 1e6)
-    return timing.start_us + timing.start_time_offset_us + timing.duration_us
+
+    expert_us: int
+    stated_us: int | None
+    wait_us: int
+
+    @classmethod
+    def of(cls, draft: SceneDraft, driven: Path, lane_map: LaneMap) -> Self:
+        """Return the limits of a route: the duration that the file states, or the longest that the
+        expert may take.
+        """
+        lights = lights_on(driven, lane_map.signals, lane_map.lanes)
+        cycles_us = [sum(us for _, us in light.signal.phases) for light in lights]
+        wait_us = max([round(LEAST_WAIT_S * 1e6), *cycles_us])
+        timing = draft.spec.timing
+        if timing.duration_us is None:
+            free_drive_s = driven.length_m / draft.spec.ego.cruise_mps
+            longest_s = max(LONGEST_S, LONGEST_SHARE * free_drive_s)
+            return cls(round(longest_s * 1e6), None, wait_us)
+        stated_us = timing.start_us + timing.start_time_offset_us + timing.duration_us
+        return cls(stated_us, stated_us, wait_us)
+
+    def of_scene_us(self, arrived_us: int) -> int:
+        """Return the last time of a scene in which the expert arrives at a time: a policy may be
+        slower, and may miss a green light.
+        """
+        if self.stated_us is not None:
+            return self.stated_us
+        return round(SLOWER_SHARE * arrived_us) + self.wait_us
 
 
 def _traffic(
@@ -138,6 +174,7 @@ def _traffic(
     line: Path,
     driven: Path,
     front_m: float,
+    limits: _TimeLimits,
 ) -> tuple[Sequence[Follower], Sequence[Actor]]:
     """Return the drivers and the walkers around the route, at places that the seed draws.
 
@@ -149,6 +186,7 @@ def _traffic(
         line: Its line, on past the goal.
         driven: The line of the rear axle up to the goal.
         front_m: From the rear axle to the front of the ego.
+        limits: How long the scene lasts at most.
     """
     followers = place_followers(
         lane_map,
@@ -164,7 +202,7 @@ def _traffic(
         front_m,
         draft.spec.ego.cruise_mps,
         spec.pedestrians,
-        grid(_end_us(draft, driven.length_m)),
+        grid(limits.of_scene_us(limits.expert_us)),
         stream(draft.scene_id, draft.spec.seed, "scenario/map/pedestrians"),
     )
     return followers, walkers

@@ -193,6 +193,9 @@ class RecordedLog:
     standing: Standing = "known"
     path_beyond: F64 | None = None  # None: what the lanes of the map behind the drive say
     path_end: PathEndKind = "record"
+    # last time of the scene, up to which its traffic is known, where the ego's drive has ended before
+    # at its goal; None: the scene ends with that drive
+    goes_on_until_us: int | None = None
 
 
 def checked_trajectory(

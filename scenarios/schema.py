@@ -229,7 +229,7 @@ class TimingSpec(Part):
         default=None,
         gt=0,
         le=b.TIME_US.high,
-        description="From the first frame; none: 8 s on a built road, else to the end of the log or route.",
+        description="From the first frame; none: 8 s on a built road, to the end of a log, and on a map 1.5 times as long as the expert needs and a cycle of a light.",
     )
     warmup_us: int = within(b.TIME_US, "How long the log is forced from then.", 500_000)
     stop_at_path_end: bool = field(

@@ -65,7 +65,7 @@ def session_findings(scene: Scenario, address: str) -> list[Finding]:
         scene: Whose recorded drive they follow; it lasts twice `QUERIES` steps at least.
         address: As `driver_at` takes it.
     """
-    if scene.end_us < scene.start_us + 2 * QUERIES * scene.rates.policy_us:
+    if scene.recorded_until_us < scene.start_us + 2 * QUERIES * scene.rates.policy_us:
         text = f"not tried: scene {scene.scene_id!r} has fewer than {2 * QUERIES} queries"
         return [Finding(name, "noted", text) for name in (INTERLEAVED, READ_ONLY, ANEW)]
     driver = driver_at(scene, address)

@@ -61,11 +61,12 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) ->
     """
     if path.suffix != ".png":
         raise InputError(f"{path}: the image is a PNG", "Name a file that ends in .png.")
-    times = [int(t_us) for t_us in np.linspace(scenario.start_us, scenario.end_us, MOMENTS)]
+    end_us = scenario.recorded_until_us
+    times = [int(t_us) for t_us in np.linspace(scenario.start_us, end_us, MOMENTS)]
     actors = [
         actor
         for actor in scenario.actors
-        if actor.track.t_us[0] <= scenario.end_us and actor.track.t_us[-1] >= scenario.start_us
+        if actor.track.t_us[0] <= end_us and actor.track.t_us[-1] >= scenario.start_us
     ]
     facts = _facts(scenario, actors)
     session = make_renderer(renderer or ("3dgs" if scenario.model else "clean"), scenario)
@@ -85,9 +86,9 @@ def draw_preview(scenario: Scenario, path: Path, renderer: str | None = None) ->
 
 def _facts(scenario: Scenario, actors: Sequence[Actor]) -> list[str]:
     log = scenario.ego_log
-    inside = (log.t_us >= scenario.start_us) & (log.t_us <= scenario.end_us)
+    inside = (log.t_us >= scenario.start_us) & (log.t_us <= scenario.recorded_until_us)
     length_m = float(np.hypot(*np.diff(log.xyz[inside, :2], axis=0).T).sum())
-    duration_s = (scenario.end_us - scenario.start_us) * 1e-6
+    duration_s = (scenario.recorded_until_us - scenario.start_us) * 1e-6
     kinds = Counter(actor.label for actor in actors)
     users = ", ".join(f"{count} {label}" for label, count in kinds.items()) or "nobody else"
     reacting = sum(actor.behaviour.kind != "replay" for actor in actors)

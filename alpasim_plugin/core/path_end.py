@@ -20,6 +20,9 @@ SPEED_SPAN_US = 500_000
 REACH_M = 2.0  # beside twice what the ego has moved: how far along the path it may have come
 LEFT_M = 4.0  # from the path: it is found again anywhere
 FOUND_M = 2.0  # where it is this near
+LOST_M = (
+    30.0  # farther from the path nobody comes back to it; CARLA's leaderboard ends a route there
+)
 
 
 class PathOfScene(Protocol):
@@ -123,6 +126,7 @@ class PathEnd:
         goes_on = len(scene.path_beyond) > 0 or scene.path_end != "record" or moves_at_end(log)
         self._has_end = goes_on and self._length_m > DIRECTION_M
         self._end = line[-1]
+        self._line = line
         if self._has_end:
             inside_m = self._length_m - DIRECTION_M
             inside = [float(np.interp(inside_m, along_m, line[:, axis])) for axis in (0, 1)]
@@ -141,6 +145,10 @@ class PathEnd:
             is_beyond = s_m >= self._length_m * (1 - 1e-12) and offset @ self._ahead > 0.0
             self.passed = bool(is_beyond and aside_m <= ASIDE_M)
         return self.passed and self._stops
+
+    def is_lost(self, axle_xy: F64) -> bool:
+        """Tell whether the ego's rear axle ``(2,)`` is far from the whole path."""
+        return abs(project(self._line, axle_xy)[1]) > LOST_M
 
 
 def moves_at_end(log: Trajectory) -> bool:

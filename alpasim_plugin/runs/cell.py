@@ -508,9 +508,11 @@ def find_rollout_state(
         return "drive", state
     if not manifest.ok:
         return "none", state
-    # Presets that stop at the end of the path and those that drive on differ in these alone.
+    # Presets that stop at the end of the path and those that drive on differ in these alone: who
+    # has passed it, and who had more time to come to a goal.
     stops_alike = manifest.stops_at_path_end == cell.stops_at_path_end
-    if manifest.passed_path_end and not stops_alike:
+    had_its_time = cell.most_steps is None or manifest.steps == cell.most_steps
+    if not stops_alike and (manifest.passed_path_end or not had_its_time):
         return "drive", state
     is_filmed = VIDEO_NAME in manifest.files or manifest.video == video
     if _wants_film(video, manifest) and not is_filmed:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from alpasim_plugin.control import make_controller
+from alpasim_plugin.core.clock import Clock
 from alpasim_plugin.core.devices import require_device
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.flags import Flag
@@ -92,6 +93,7 @@ class Cell:
     score_key: str  # digest of rollout_key and of everything that determines the scores
     # as scenario and preset say; not in the key, since it matters only to a rollout that passes it
     stops_at_path_end: bool = True
+    most_steps: int | None = None  # of a rollout that ends by time; in no key, like the one above
     # parts without a digest (remote services): the rollout is reused on request only
     undigested: tuple[str, ...] = ()
 
@@ -222,6 +224,8 @@ def make_plan(
             parts[f"source of {scenario.scene_id}"] = sources[scenario.source_part]
             made_of = parts | {SIMRUN: loop} | _facts_of(scenario, seed, options)
             rollout_key = digest(made_of)
+            driven = replace(scenario, stop_at_path_end=scenario.stop_at_path_end and stops)
+            clock = Clock(driven.start_us, driven.drive_until_us, driven.rates)
             cells.append(
                 Cell(
                     renderer,
@@ -235,7 +239,8 @@ def make_plan(
                     scenario.content_hash,
                     rollout_key,
                     digest([rollout_key, *scoring]),
-                    scenario.stop_at_path_end and stops,
+                    driven.stop_at_path_end,
+                    clock.n_steps,
                     tuple(part for part, content in parts.items() if content is None),
                 )
             )

@@ -100,12 +100,13 @@ class Loop:
         tells_road_users: bool = False,
     ) -> None:
         self._tells_road_users = tells_road_users
-        self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
+        self._clock = clock = Clock(scenario.start_us, scenario.drive_until_us, scenario.rates)
         self._renderer, self._controller, self._recorder = (
             complete(renderer, Renderer),
             controller,
             recorder,
         )
+        self._recorded_until_us = scenario.recorded_until_us
         self._sensors = sensors
         self._world = make_actors(scenario)
         self._plans = PlanQueue(scenario.latency)
@@ -148,7 +149,7 @@ class Loop:
             for frame, request in zip(frames, requests, strict=True):
                 state.frames[frame.camera] = frame
                 recorder.frame(frame, request)
-            if self.path_end.ends_rollout(state.ego.T_world_rig[:2, 3]) or tick.is_last:
+            if self._has_ended(tick.t_us) or tick.is_last:
                 return
             if self._cadence.queries_at(tick.t_us):
                 told = self.actors if self._tells_road_users else None
@@ -165,3 +166,11 @@ class Loop:
             with recorder.stage("control"):
                 forced = state.advance(self._controller, active, tick.t_us + clock.rates.control_us)
             recorder.control_step(before, active, state.ego, forced)
+
+    def _has_ended(self, t_us: int) -> bool:
+        """Tell whether the ego has passed the end of its path, or is lost when the time of the
+        recorded drive is over: the time beyond it is for those who are on their way.
+        """
+        axle_xy = self.state.ego.T_world_rig[:2, 3]
+        has_passed = self.path_end.ends_rollout(axle_xy)
+        return has_passed or (t_us >= self._recorded_until_us and self.path_end.is_lost(axle_xy))

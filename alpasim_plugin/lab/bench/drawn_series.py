@@ -22,7 +22,7 @@ def offset_requests(scenario: Scenario, camera: CameraSpec, offset_m: float) -> 
     shift = np.eye(4)
     shift[1, 3] = offset_m
     requests = []
-    for t_us in range(scenario.start_us, scenario.end_us + 1, period_us):
+    for t_us in range(scenario.start_us, scenario.recorded_until_us + 1, period_us):
         T = interpolate(scenario.ego_log, t_us) @ shift @ camera.T_rig_camera
         requests.append(RenderRequest(t_us, camera, np.stack([T, T]), log_actors(scenario, t_us)))
     return requests

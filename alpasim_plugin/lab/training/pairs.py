@@ -111,7 +111,7 @@ def make_sequence(
 
 def _times(scenario: Scenario, recipe: PairRecipe) -> range:
     """Return the instants of the frames, microseconds."""
-    return range(scenario.start_us, scenario.end_us + 1, recipe.interval_us)
+    return range(scenario.start_us, scenario.recorded_until_us + 1, recipe.interval_us)
 
 
 def _camera_and_actors(scenario: Scenario, camera: CameraSpec) -> dict[str, Any]:

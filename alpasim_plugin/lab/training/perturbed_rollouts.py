@@ -228,7 +228,7 @@ def _start(
         s = max(float(turn_s_m or 0.0) - random.uniform(6.0, 38.0), 1.0)
         return scenario.start_us + round(random.uniform(0, 2) * 1e6), s
     t_us = scenario.start_us + round(
-        random.uniform(0.0, 0.35) * (scenario.end_us - scenario.start_us)
+        random.uniform(0.0, 0.35) * (scenario.recorded_until_us - scenario.start_us)
     )
     s = float(np.interp(t_us, scenario.ego_log.t_us, log_s)) + random.normal(0.0, 2.0)
     return t_us, max(s, 1.0)
