@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError, PolicyError
 from alpasim_plugin.core.geometry import arc_lengths, heading_of, left_of, resample
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.parts import build, unidentified
+from alpasim_plugin.core.spline import CubicSpline
 from alpasim_plugin.core.types import F64, I64, CameraSpec, Frame, Observation, Scenario
 
 # AlpaSim's minADE needs samples that reach its longest horizon, 5 s; shorter ones lose all four
@@ -155,8 +155,7 @@ def smooth_line(points: F64) -> F64:
     samples = np.arange(0.0, max(float(s[-1]), Path.SPACING_M) + 1e-9, Path.SPACING_M)
     if keep.sum() < 3:
         return resample(points, samples, s)
-    spline = scipy.interpolate.CubicSpline(s[keep], points[keep])
-    return spline(np.minimum(samples, s[-1]))
+    return CubicSpline.through(s[keep], points[keep]).at(np.minimum(samples, s[-1]))
 
 
 def extended(points: F64, length_m: float) -> F64:

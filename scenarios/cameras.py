@@ -8,14 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from alpasim_plugin.cameras.lens import check_lens, resized
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import limits as b
 from alpasim_plugin.core.files.config import Document, load_yaml, validate
 from alpasim_plugin.core.files.reading import contents
-from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid
+from alpasim_plugin.core.geometry import RIG_FROM_LEVEL_CAMERA, intrinsics, rigid, turned
 from alpasim_plugin.core.types import CameraSpec, LensModel, Vehicle
 from scenarios.schema import CameraModel, CameraSet, Rigs
 from scenarios.variation import SceneDraft
@@ -92,8 +91,8 @@ def camera_spec(model: CameraModel | None = None) -> CameraSpec:
     focal = m.focal_px or (_focal_px(m),) * 2
     middle = m.centre_px or (m.width / 2, m.height / 2)
     K = intrinsics(*focal, *middle)
-    turns = Rotation.from_euler("ZY", [m.yaw_deg, m.pitch_down_deg], degrees=True)
-    T = rigid(turns.as_matrix() @ RIG_FROM_LEVEL_CAMERA, (m.x_m, m.y_m, m.z_m))
+    turn = turned(np.deg2rad(m.yaw_deg), np.deg2rad(m.pitch_down_deg))
+    T = rigid(turn @ RIG_FROM_LEVEL_CAMERA, (m.x_m, m.y_m, m.z_m))
     lens = None
     if m.lens != "pinhole":
         coefficients = m.coefficients or ((0.0, focal[0]) if m.lens == "ftheta" else ())

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.spatial.transform import Rotation
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.cameras.lens import rays_of
 from alpasim_plugin.core.errors import InputError
@@ -183,7 +183,9 @@ def mount(sensor: JsonObject) -> F64:
     nominal = sensor["nominalSensor2Rig_FLU"]
     turn = (sensor.get("correction_sensor_R_FLU") or {}).get("roll-pitch-yaw", (0.0, 0.0, 0.0))
     shift = sensor.get("correction_rig_T") or (0.0, 0.0, 0.0)
-    turns = Rotation.from_euler("xyz", [nominal["roll-pitch-yaw"], turn], degrees=True).as_matrix()
+    turns = scipy.spatial.transform.Rotation.from_euler(
+        "xyz", [nominal["roll-pitch-yaw"], turn], degrees=True
+    ).as_matrix()
     return rigid(turns[0] @ turns[1] @ RIG_FROM_LEVEL_CAMERA, np.add(nominal["t"], shift))
 
 
@@ -261,7 +263,9 @@ def _sensor(name: str, camera: CameraSpec) -> dict[str, object]:
         "polynomial-type": "pixeldistance-to-angle",
         **{f"linear-{name}": repr(float(x)) for name, x in zip("cde", linear, strict=True)},
     }
-    turn = Rotation.from_matrix(camera.T_rig_camera[:3, :3] @ RIG_FROM_LEVEL_CAMERA.T)
+    turn = scipy.spatial.transform.Rotation.from_matrix(
+        camera.T_rig_camera[:3, :3] @ RIG_FROM_LEVEL_CAMERA.T
+    )
     mount = {
         "roll-pitch-yaw": turn.as_euler("xyz", degrees=True).tolist(),
         "t": camera.T_rig_camera[:3, 3].tolist(),

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+import scipy  # its submodules load on first use
 import shapely
-from scipy.ndimage import gaussian_filter1d
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.files import parsing
@@ -387,7 +387,7 @@ def _inside_bends(line: Path, front_m: float) -> Path:
     """
     swing_m = front_m**2 * line.curvature / 2
     inside_m = np.clip(swing_m / 2, -MOST_INSIDE_M, MOST_INSIDE_M)
-    smooth_m = gaussian_filter1d(inside_m, EASED_M / line.s[1], mode="nearest")
+    smooth_m = scipy.ndimage.gaussian_filter1d(inside_m, EASED_M / line.s[1], mode="nearest")
     stations = np.linspace(0.0, line.length_m, int(line.length_m / STATION_M) + 2)
     return smooth_path(line.at(stations, np.interp(stations, line.s, smooth_m))[0])
 

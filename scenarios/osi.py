@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import (
@@ -92,7 +92,7 @@ class _Track:
         """Return the poses of the box centre."""
         table = np.array(self.rows)
         table[:, 3] += self.raised_m
-        turns = Rotation.from_euler("ZYX", np.nan_to_num(table[:, 4:]))
+        turns = scipy.spatial.transform.Rotation.from_euler("ZYX", np.nan_to_num(table[:, 4:]))
         return checked_trajectory(
             location,
             table[:, 0].astype(np.int64),

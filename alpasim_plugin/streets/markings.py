@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.geometry import arc_lengths, direction_of, left_of, resample, unit
 from alpasim_plugin.core.types import F64, I64, LaneMarkType
@@ -66,11 +65,12 @@ def _with_phase(lines: list[tuple[F64, LaneMarkType]]) -> list[tuple[F64, LaneMa
     """Give each line the length of the markings before it, so that dashes run on from lane to lane."""
     if not lines:
         return []
-    tree = scipy.spatial.KDTree([line[0] for line, _ in lines])
+    start = np.array([line[0] for line, _ in lines])
     following: list[list[int]] = [[] for _ in lines]
     has_one_before = [False] * len(lines)
     for i, (line, mark_type) in enumerate(lines):
-        for j in sorted(tree.query_ball_point(line[-1], JOINED_M)):
+        distance2 = np.sum((start - line[-1]) ** 2, axis=1)
+        for j in np.flatnonzero(distance2 <= JOINED_M**2).tolist():
             if j != i and not has_one_before[j] and lines[j][1] == mark_type:
                 following[i].append(j)
                 has_one_before[j] = True

@@ -11,6 +11,7 @@ import scipy  # its submodules load on first use
 
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import arc_lengths, cross, direction_of, heading_of, step_lengths
+from alpasim_plugin.core.spline import CubicSpline
 from alpasim_plugin.core.types import F64, I64, Bool
 
 ABOUT_M = 5.0  # a place whose arc length is nearly known is looked for so far to both sides
@@ -322,12 +323,12 @@ def smooth_path(xyz: F64, step_m: float = 0.25) -> Path:
     ``step_m``.
     """
     coarse = polyline_path(xyz)
-    spline = scipy.interpolate.CubicSpline(coarse.s, coarse.xyz)
+    spline = CubicSpline.through(coarse.s, coarse.xyz)
     fine = np.linspace(0.0, coarse.length_m, max(2, int(np.ceil(coarse.length_m / step_m)) + 1))
-    d = spline(fine, 1)
-    dd = spline(fine, 2)
+    d = spline.at(fine, derivative=1)
+    dd = spline.at(fine, derivative=2)
     speed2 = d[:, 0] ** 2 + d[:, 1] ** 2
-    line = spline(fine)
+    line = spline.at(fine)
     return Path(
         arc_lengths(line),
         line,

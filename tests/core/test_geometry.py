@@ -21,6 +21,7 @@ from alpasim_plugin.core.geometry import (
     se2,
     slerp,
     trajectory_from_poses,
+    turned,
     wrap_angle,
     yaw_from_quat,
 )
@@ -33,6 +34,13 @@ four = st.lists(st.floats(-1, 1), min_size=4, max_size=4)
 unit_quats = four.filter(lambda q: np.linalg.norm(q) > 1e-3).map(
     lambda q: np.array(q) / np.linalg.norm(q)
 )
+
+
+@settings(deadline=None)
+@given(st.floats(-180, 180), st.floats(-180, 180))
+def test_a_yaw_and_a_pitch_are_those_of_scipy(yaw_deg, pitch_deg):
+    expected = Rotation.from_euler("ZY", [yaw_deg, pitch_deg], degrees=True).as_matrix()
+    assert_allclose(turned(*np.deg2rad([yaw_deg, pitch_deg])), expected, atol=1e-15)
 
 
 @settings(deadline=None)
