@@ -33,6 +33,7 @@ from alpasim_plugin.core.errors import (
     is_interruption,
 )
 from alpasim_plugin.core.files.places import damaged_kernels
+from alpasim_plugin.core.garbage import collect_seldom
 from alpasim_plugin.core.kept_threads import end_kept_threads
 from alpasim_plugin.core.lazy import installed_names
 from alpasim_plugin.core.printing import (
@@ -503,6 +504,7 @@ def _lacks_memory(error: BaseException) -> bool:
 def main() -> None:
     """Run the process's command line and exit with its code."""
     leave_at_once()
+    collect_seldom()
     print_any_character()
     if COMPLETION in os.environ:
         app(prog_name="simrun")

@@ -29,6 +29,7 @@ from typing import Any, Generic, TypeVar
 
 from alpasim_plugin.alpasim.client.child import end_children
 from alpasim_plugin.core.errors import InfrastructureError, InternalError, SimrunError
+from alpasim_plugin.core.garbage import collect_seldom
 from alpasim_plugin.core.parts.blame import Culprit, Note, note_in
 from alpasim_plugin.core.parts.patches import watch_code
 from alpasim_plugin.core.printing import warn
@@ -475,6 +476,7 @@ def _serve(connection: Connection, note: Path) -> None:
     and ends with its parent.
     """
     forget_safe_path()
+    collect_seldom()
     lead_group()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()

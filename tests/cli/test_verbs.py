@@ -10,6 +10,7 @@ import pytest
 from rich.table import Table
 
 from alpasim_plugin.cli.output import Progress, show
+from alpasim_plugin.core.garbage import OBJECTS
 from tests.cli.verb_options import CORE, OWN, options_of
 
 REPO = Path(__file__).resolve().parents[2]
@@ -62,9 +63,16 @@ def test_a_listing_loads_no_numerical_library():
     )
 
 
+def test_a_command_looks_for_cycles_seldom():
+    """At Python's own threshold that took a twentieth of the README's main job."""
+    code = "import atexit, gc, sys; atexit.register(lambda: print(gc.get_threshold()[0])); sys.argv = ['simrun', '--version']; from alpasim_plugin.cli.main import main; main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == str(OBJECTS)
+
+
 def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels():
     """Its workers load what drives; while they are started, nothing else is to load here."""
-    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'scipy.stats', 'torch', 'av'} & sys.modules.keys())"
+    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'scipy.spatial', 'scipy.stats', 'torch', 'av'} & sys.modules.keys())"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True

@@ -1,5 +1,6 @@
 """Workers that die, hang or lose their parent cost their own item and nothing else."""
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from alpasim_plugin.core.errors import InfrastructureError
+from alpasim_plugin.core.garbage import OBJECTS
 from alpasim_plugin.lab.jobs import map_jobs
 from alpasim_plugin.runs import local_executor as local
 from alpasim_plugin.runs.local_executor import Lost, run_jobs
@@ -72,6 +74,14 @@ def test_a_worker_has_its_threads_and_passes_no_safe_path_on(threads):
     ((_, seen),) = run_jobs(environment, ["OMP_NUM_THREADS"], 1, threads, limit_s=60.0)
     assert seen == (str(threads), None)
     assert "PYTHONSAFEPATH" not in os.environ
+
+
+def collected_after(_):
+    return gc.get_threshold()[0]
+
+
+def test_a_worker_looks_for_cycles_as_seldom_as_a_command():
+    assert [count for _, count in run_jobs(collected_after, ["once"], 1, limit_s=60.0)] == [OBJECTS]
 
 
 def environment(name):
