@@ -82,7 +82,7 @@ def kernel_maker(**options: Any) -> Maker:
 def folder_of(file: str) -> Path:
     """Return the folder for the machine code of the kernels of a source file."""
     made_by = f"{numba.__version__} {binding.get_host_cpu_name()}"
-    key = hashlib.sha256(f"{sources_digest(file)} {made_by}".encode()).hexdigest()
+    key = hashlib.sha256(f"{sources_digest(file, Path(KEPT))} {made_by}".encode()).hexdigest()
     return Path(KEPT) / f"{Path(file).stem}-{key[:16]}"
 
 

@@ -2,6 +2,7 @@
 nothing.
 """
 
+import ast
 import fcntl
 import os
 import subprocess
@@ -11,7 +12,8 @@ from pathlib import Path
 import pytest
 from numba.core import event
 
-from alpasim_plugin.core.kernel_sources import ROOT, sources_digest, sources_of
+from alpasim_plugin.core import kernel_sources
+from alpasim_plugin.core.kernel_sources import ROOT, SAID, sources_digest, sources_of
 from alpasim_plugin.core.kernels import LOCK, OneCompiler
 
 KERNEL = """
@@ -58,13 +60,57 @@ def test_a_kernel_is_made_of_the_constants_and_kernels_that_it_uses(folder):
     assert used == {"kern.py", "constants.py", "shapes.py", "inner.py", "other.py"}
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_an_edit_of_what_a_kernel_uses_makes_another_folder_and_no_other_edit_does(folder, name):
+def test_what_sources_say_is_read_from_where_it_is_kept_and_is_the_same(folder, monkeypatch):
+    files = [str(folder / name) for name in FILES]
+    parsed = [sources_digest(file) for file in files]
+    assert [sources_digest(file, folder / "kept") for file in files] == parsed
+    assert len(list((folder / "kept" / SAID).iterdir())) == len(FILES)
+    forget_sources()
+    with monkeypatch.context() as patch:
+        patch.delattr(ast, "parse")  # so that whatever parses fails
+        assert [sources_digest(file, folder / "kept") for file in files] == parsed
+
+
+@pytest.mark.parametrize("damage", ["", "{", "{}", "[1]", '{"bound": {}}'])
+def test_what_is_kept_and_damaged_is_parsed_and_kept_again(folder, damage):
     file = str(folder / "kern.py")
-    before = sources_digest(file)
+    parsed = sources_digest(file, folder / "kept")
+    whole = {path: path.read_text() for path in (folder / "kept" / SAID).iterdir()}
+    for path in whole:
+        path.write_text(damage)
+    forget_sources()
+    assert sources_digest(file, folder / "kept") == parsed
+    assert {path: path.read_text() for path in whole} == whole
+
+
+def test_a_name_that_moves_to_a_new_file_is_found_there_although_all_is_kept(folder):
+    (folder / "inner.py").write_text("from depth import BASE\n")
+    (folder / "depth").mkdir()
+    (folder / "depth/__init__.py").write_text("BASE = 4\n")
+    before = sources_digest(str(folder / "kern.py"), folder / "kept")
+    (folder / "depth/BASE.py").write_text("COUNT = 5\n")
+    forget_sources()
+    assert sources_digest(str(folder / "kern.py"), folder / "kept") != before
+
+
+def forget_sources():
+    """Do what another process begins with."""
+    kernel_sources.sources_of.cache_clear()
+    kernel_sources._module.cache_clear()
+
+
+@pytest.mark.parametrize("kept", [None, "kept"])
+@pytest.mark.parametrize("name", FILES)
+def test_an_edit_of_what_a_kernel_uses_makes_another_folder_and_no_other_edit_does(
+    folder, name, kept
+):
+    file = str(folder / "kern.py")
+    where = kept and folder / kept
+    before = sources_digest(file, where)
+    forget_sources()
     (folder / name).write_text(f"{FILES[name]}# edited\n")
     is_used = name not in ("words.py", "unused.py")
-    assert (sources_digest(file) != before) == is_used
+    assert (sources_digest(file, where) != before) == is_used
 
 
 def test_kernels_of_simrun_know_the_size_of_a_tile_and_not_the_command_line():
