@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alpasim_plugin.core.geometry import (
+    arc_lengths,
     direction_of,
     heading_of,
     interpolate,
@@ -60,6 +61,7 @@ MAX_STEP_S = 0.05  # the model is integrated in steps no longer than this
 MIN_PATH_M = 1.0  # a reactive driver whose track is shorter than this follows it to its end
 LINE_STEP_M = 0.5  # poses nearer to each other than this say nothing about a track's direction
 EXTENSION_M = 300.0
+SAME_M = 1e-3  # a way that is shorter has no direction
 MAX_TURN_RAD = 0.8
 FOLD = -0.5  # cosine between two steps of a track, below which it turns back on itself
 FADE_M = 20.0
@@ -661,7 +663,7 @@ def _lanes_ahead(index: LaneIndex, end: F64, heading: float, half_height_m: floa
     if lane is None or turns[lane] >= MAX_TURN_RAD:
         return None
     xyz = index.path_ahead(lane, EXTENSION_M, start=end).xyz
-    if len(xyz) < 2:
+    if float(arc_lengths(xyz)[-1]) < SAME_M:  # the map ends here
         return None
     way = polyline_path(xyz)
     _, offset = way.project(end[None, :2])

@@ -170,6 +170,15 @@ def test_reactive_driver_goes_on_along_the_lanes_where_its_track_ends():
     assert "a" not in poses[-1], "it leaves the scene at the end of the map"
 
 
+def test_a_track_that_ends_with_the_last_lane_of_the_map_is_driven_to_its_end():
+    lane = Lane("a", np.array([[-5.0, 0, 0], [10.00005, 0, 0]]), None, None)
+    behaviour = Behaviour("idm", {"desired_speed_mps": 10})
+    short = Actor("a", "car", BOX, line_track(0, 10, 1.0), behaviour=behaviour)
+    actors = Actors([short], Vehicle(), 500_000, LaneMap({"a": lane}), flat())
+    x = run(actors, FAR_AWAY, 3_000_000)["a"]
+    assert 9.0 <= x[-1] <= 10.0
+
+
 def test_reactive_driver_with_a_track_that_goes_nowhere_stays_on_it():
     parked = Actor("a", "car", BOX, line_track(5, 0.0), behaviour=Behaviour("idm"))
     actors = Actors([parked], Vehicle(), 0, ground=flat())
