@@ -300,7 +300,7 @@ def pretended_device(patch, computes=True):
     from alpasim_plugin.block_fixers.pipeline import BlockPipeline
     from alpasim_plugin.fixers import pixel_fixer
     from alpasim_plugin.fixers.semantic_map import tile_kernel
-    from alpasim_plugin.gaussians.raster import rasterize_triton, triton_kernels
+    from alpasim_plugin.gaussians.raster import rasterize_triton
 
     patch.setattr(torch.cuda, "is_available", lambda: True)
     patch.setattr(torch.cuda, "device_count", lambda: 1)
@@ -320,7 +320,8 @@ def pretended_device(patch, computes=True):
     patch.setattr(torch.cuda, "stream", nullcontext)
     patch.setattr(torch.Tensor, "pin_memory", _pinned)
     patch.setattr(torch.cuda, "device", nullcontext)
-    patch.setattr(rasterize_triton, "triton_kernels", lambda: _Kernels(triton_kernels))
+    modules = rasterize_triton.triton_kernels
+    patch.setattr(rasterize_triton, "triton_kernels", lambda *name: _Kernels(modules(*name)))
     patch.setattr(tile_kernel, "draw_tiles", _Launches(tile_kernel.draw_tiles))
     # Subclasses of tensors do not work in inference mode; gradients are off in either.
     plain = torch.no_grad()(pixel_fixer.fix_frame.__wrapped__)  # type: ignore[attr-defined]

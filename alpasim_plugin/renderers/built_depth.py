@@ -32,7 +32,7 @@ class BuiltDepth:
         """Return the depth ``(H, W)`` of a requested frame, metres along the optical axis at the
         time of each pixel; 0 where the scene shows no surface.
         """
-        return draw_requests([request], self._draw, self.device)[0].on_host().depth
+        return draw_requests([request], self._draw)[0].on_host().depth
 
     def of_recorded(self, frame: RecordedFrame, height: int, width: int) -> F32:
         """Return the depth ``(H, W)`` at the pose of a recorded frame, as `of_request`."""

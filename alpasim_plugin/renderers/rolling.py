@@ -1,6 +1,6 @@
-"""Draw the frames of an instant. On the CPU a lens is drawn along each pixel's ray, and a rolling
-shutter at each pixel's time; on a card pinholes are drawn, and a rolling shutter in bands, each from
-the pose, and with the road users, of its instant.
+"""Draw the frames of an instant: a lens along each pixel's ray, and a rolling shutter at each pixel's
+time. Only the pinholes that cover a lens for a renderer that draws no lenses are drawn in bands, where
+they are exposed neither by rows nor by columns.
 """
 
 from abc import abstractmethod
@@ -15,14 +15,13 @@ from alpasim_plugin.cameras.shutter import (
     largest_motion_px,
     motion_px,
 )
-from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.interfaces import Renderer
 from alpasim_plugin.core.types import F64, Frame, RenderRequest
-from alpasim_plugin.gaussians.camera import Rolling
+from alpasim_plugin.gaussians.camera import PinholeCamera, Rolling
 from alpasim_plugin.gaussians.lens_camera import lens_rays
 from alpasim_plugin.gaussians.raster.output import RasterOutput
-from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneView, pinhole_of, posed
+from alpasim_plugin.gaussians.scene.scene_graph import Camera, SceneView, posed
 
 NEARER = 4.0  # what is so many times nearer than `shutter.NEAR_M` is still looked for in full
 JUDGED_RAYS = 200  # of a lens, by which the motion in its image is bounded
@@ -33,12 +32,8 @@ class SplatRenderer(Renderer):
     """A renderer of Gaussians: the views of all cameras of an instant are drawn in one call."""
 
     has_history = False
+    draws_lenses = True
     device: str
-
-    @property
-    def draws_lenses(self) -> bool:  # type: ignore[override]  # by the device
-        """Whether lenses are drawn, and not the pinholes that cover them: on the CPU."""
-        return bool(implementation(self.device, True, False))
 
     def render(self, request: RenderRequest) -> Frame:
         """Render one frame."""
@@ -46,7 +41,7 @@ class SplatRenderer(Renderer):
 
     def render_batch(self, requests: Sequence[RenderRequest]) -> list[Frame]:
         """Render the frames of an instant. What a device drew stays there."""
-        outs = draw_requests(requests, self.draw, self.device)
+        outs = draw_requests(requests, self.draw)
         return [
             self.developed(request, out).frame(request.t_us, request.camera.name)
             for request, out in zip(requests, outs, strict=True)
@@ -61,28 +56,26 @@ class SplatRenderer(Renderer):
         return out
 
 
-def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) -> list[RasterOutput]:
+def draw_requests(requests: Sequence[RenderRequest], draw: Draw) -> list[RasterOutput]:
     """Draw the frames of requests; those without an exposure at the shutter's end.
 
-    Where whole rows or columns are exposed at once, the CPU rasteriser draws each Gaussian at the
-    time of its pixel. Otherwise the frame is drawn in `bands`, which are joined where they were
-    drawn; a lens is not.
+    Where whole rows or columns are exposed at once, the rasteriser draws each Gaussian at the time of
+    its pixel. Otherwise a pinhole's frame is drawn in `bands`, which are joined where they were drawn.
 
     Args:
         requests: What to draw.
         draw: Draws the views of all.
-        device: That of ``draw``.
 
     Returns:
         The images; a pixel that nobody looks at is black and opaque. Depth is along the axis of
         the pose at the pixel's time, through a lens from the camera's centre.
     """
-    cuts = [_cut(request, device) for request in requests]
+    cuts = [_cut(request) for request in requests]
     frames = iter(draw([view for cut in cuts for _, view in cut]))
     outs = []
     for request, cut in zip(requests, cuts, strict=True):
         out, *_ = parts = [next(frames) for _ in cut]
-        again = partial(draw_requests, [request], draw, device)
+        again = partial(draw_requests, [request], draw)
         if cut[0][0] is not None:
             out = out.blank(request.camera.height, request.camera.width, parts, again)
         for (band, _), part in zip(cut, parts, strict=True):
@@ -94,17 +87,17 @@ def draw_requests(requests: Sequence[RenderRequest], draw: Draw, device: str) ->
     return outs
 
 
-def _cut(request: RenderRequest, device: str) -> list[tuple[Band | None, SceneView]]:
+def _cut(request: RenderRequest) -> list[tuple[Band | None, SceneView]]:
     """Return the bands that are drawn of a request and their views; None: the whole image."""
     if request.exposure is None:
         return [(None, (camera_at(request, request.T_world_camera[1]), request.actors))]
-    if implementation(device, 1 in request.exposure.share.shape, False):
+    if 1 in request.exposure.share.shape:
         return [(None, _rolling(request))]
     cut: list[tuple[Band | None, SceneView]] = []
     for band in bands(request):
-        camera = pinhole_of(camera_at(request, band.T_world_camera))
-        camera = camera.window(band.rows, band.columns)
-        cut.append((band, (camera, band.actors)))
+        camera = camera_at(request, band.T_world_camera)
+        assert isinstance(camera, PinholeCamera), "a lens is exposed by rows or columns"
+        cut.append((band, (camera.window(band.rows, band.columns), band.actors)))
     return cut
 
 

@@ -19,13 +19,34 @@ from triton.compiler import ASTSource
 
 from alpasim_plugin.fixers.semantic_map.on_device import COLUMNS, tile_kernel
 from alpasim_plugin.gaussians.constants import TILE
-from alpasim_plugin.gaussians.raster import triton_kernels as kernels
+from alpasim_plugin.gaussians.raster import triton_kernels, triton_lens_kernels
+from alpasim_plugin.gaussians.raster.lens_on_device import record_length
 from alpasim_plugin.gaussians.raster.rasterize_triton import BLOCK, CHUNK
 
-CONSTANTS = {"SIZE": 16, "TILE": TILE, "BLOCK": BLOCK, "CHUNK": CHUNK, "COLUMNS": COLUMNS}
+CONSTANTS = {
+    "SIZE": 16,
+    "TILE": TILE,
+    "BLOCK": BLOCK,
+    "CHUNK": CHUNK,
+    "COLUMNS": COLUMNS,
+    # A lens with all its terms and a rolling shutter takes most registers.
+    "LENGTH": record_length(rolls=True),
+    "ROLLS": True,
+    "BENDS": True,
+}
+KERNELS = (
+    triton_kernels.project,
+    triton_kernels.list_tiles,
+    triton_kernels.composite,
+    triton_kernels.composite_backward,
+    triton_lens_kernels.project_lens,
+    triton_lens_kernels.composite_lens,
+    tile_kernel.draw_tiles,
+)
+DOUBLES = ("poses", "camera", "means", "primitives", "samples", "cameras", "lenses", "motion")
 TYPES = {
     "*u8": ("levels",),
-    "*fp64": ("poses", "camera", "means", "primitives", "samples", "cameras"),
+    "*fp64": DOUBLES,
     "*i32": ("spans", "boxes", "counts", "tiles", "splats", "starts"),
     "*i64": ("order", "ends", "places"),
     "fp32": ("near_m",),
@@ -55,6 +76,5 @@ def resources(kernel: Any, capability: int) -> str:
 
 if __name__ == "__main__":
     for wanted in map(int, sys.argv[1:]):
-        for name in ("project", "list_tiles", "composite", "composite_backward", "draw_tiles"):
-            kernel = getattr(kernels, name, tile_kernel.draw_tiles)
-            print(f"{name} sm_{wanted} {resources(kernel, wanted)}")
+        for kernel in KERNELS:
+            print(f"{kernel.fn.__name__} sm_{wanted} {resources(kernel, wanted)}")

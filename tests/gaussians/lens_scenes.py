@@ -2,11 +2,18 @@
 
 import numpy as np
 
+from alpasim_plugin.cameras.lens import radial_form, resized
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import CameraSpec, LensModel
 from alpasim_plugin.gaussians import GaussianCloud
 from alpasim_plugin.gaussians.camera import Rolling
 from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster.lens_rays import (
+    LENS_BEND,
+    LENS_LEAST,
+    LENS_SMALL,
+    tile_rays,
+)
 from tests.gaussians.lens_reference import Motion
 
 WIDTH = 80
@@ -47,13 +54,14 @@ WORLD = pose([0.1, 0.2, -0.1], [0.1, 0.2, 0.3])
 BACK = pose([0.0, -0.00785, 0.0], [0.02, 0.01, -0.225])
 
 
-def camera(name, rolls=False, T_world_camera=WORLD):
+def camera(name, rolls=False, T_world_camera=WORLD, size=(WIDTH, HEIGHT)):
     T = inverse(T_world_camera)
+    seen = resized(spec(name), *size)
     if not rolls:
-        return LensCamera(spec(name), T)
-    step = 1 / (HEIGHT - 1)
+        return LensCamera(seen, T)
+    step = 1 / (size[1] - 1)
     start = inverse(T_world_camera @ BACK)
-    return LensCamera(spec(name), T, Rolling(start, {}, (0.0, step, -0.5 - 0.5 * step), 10.0))
+    return LensCamera(seen, T, Rolling(start, {}, (0.0, step, -0.5 - 0.5 * step), 10.0))
 
 
 def cloud_of(p, scales, opacity=0.8, seed=0, antialias_px2=0.0, T_world_camera=WORLD):
@@ -75,3 +83,66 @@ def around(count, seed, least_m=1.0, most_m=20.0):
     d = rng.normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     return d * rng.uniform(least_m, most_m, (count, 1))
+
+
+HARD = {
+    "behind": (around(80, 5) - [0, 0, 12.0], (0.3, 0.2, 0.1)),
+    "at 90 degrees and beyond": (
+        [
+            [3 * np.sin(a), 0.2 * k, 3 * np.cos(a)]
+            for k, a in enumerate(np.deg2rad([85, 90, 95, 105]))
+        ],
+        (0.4, 0.1, 0.3),
+    ),
+    "needles": (around(60, 6), (10.0, 1e-3, 1e-3)),
+    "discs": (around(60, 7, 0.5), (1.0, 1.0, 1e-4)),
+    "flat ones in the plane of a ray": (
+        [[0, 0.0, 4], [0, 0.001, 6], [0.3, 0, 5]],
+        (1.0, 1.0, 1e-6),
+    ),
+    "enclosing": (around(12, 8, 0.2, 1.5), (1.5, 1.0, 0.8)),
+    "large beside the camera": (
+        [[2.0, 0, 0.1], [-1.5, 0.5, -0.5], [0, 1.5, 0.5]],
+        (3.0, 1.0, 0.05),
+    ),
+    "near": (around(60, 9, 0.3, 1.0), (0.05, 0.02, 0.01)),
+}
+
+FINE = {
+    "opencv": (700.0, 30, LensModel("opencv", (-0.1, 0.01, 1e-3, -7e-4))),
+    "fisheye": (400.0, 70, LensModel("fisheye", (0.02, -0.004), max_angle_rad=np.deg2rad(100))),
+    "ftheta": (1.0, 60, LensModel("ftheta", (0.0, 800.0, 0.0, -15.0))),
+}
+
+
+def fine_camera(name, rolls, size=(200, 150)):
+    """Return a part, off the axis, of an image so fine that Gaussians are drawn as ellipses."""
+    focal, off_deg, lens = FINE[name]
+    whole = CameraSpec(name, WIDTH, HEIGHT, np.diag([focal, focal, 1.0]), np.eye(4), 0, lens)
+    off_px = radial_form(whole).radius(np.array([np.deg2rad(off_deg)]))[0]
+    off_px *= np.linalg.norm(radial_form(whole).linear, 2)
+    K = whole.K.copy()
+    width, height = size
+    K[:2, 2] = width / 2 - 0.8 * off_px, height / 2 - 0.6 * off_px
+    seen = CameraSpec(name, width, height, K, np.eye(4), 0, lens)
+    if not rolls:
+        return LensCamera(seen, inverse(WORLD))
+    step = 1 / (height - 1)
+    time = (0.0, step, -0.5 - 0.5 * step)
+    return LensCamera(seen, inverse(WORLD), Rolling(inverse(WORLD @ BACK), {}, time, 60.0))
+
+
+SHAPES = np.array([[1, 1, 0.02], [1, 0.02, 0.02], [0.5, 0.4, 0.3]])  # discs, needles, others
+
+
+def largest_small(seen, count, seed):
+    """Return Gaussians in an image, as large as ellipses may be, and of any opacity and colour."""
+    rng = np.random.default_rng(seed)
+    rays = seen.rays().reshape(-1, 3)
+    distance = np.exp(rng.uniform(np.log(4), np.log(40), (count, 1)))
+    p = rays[rng.integers(len(rays), size=count)] * distance
+    numbers = tile_rays(seen).lens
+    low_pass = numbers[LENS_BEND] * 0.55 / numbers[LENS_LEAST]
+    most = (numbers[LENS_SMALL] - low_pass) / (1 + numbers[LENS_BEND]) * distance
+    assert (most > 0).all()
+    return cloud_of(p, most * SHAPES[rng.integers(3, size=count)], rng.uniform(0.3, 1, count), seed)

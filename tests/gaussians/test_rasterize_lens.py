@@ -3,11 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from alpasim_plugin.cameras.lens import radial_form
 from alpasim_plugin.cameras.shutter import rolling as shares
 from alpasim_plugin.core.errors import InputError
 from alpasim_plugin.core.geometry import inverse
-from alpasim_plugin.core.types import CameraSpec, LensModel
 from alpasim_plugin.gaussians import (
     GaussianCloud,
     PinholeCamera,
@@ -19,15 +17,13 @@ from alpasim_plugin.gaussians.camera import Rolling
 from alpasim_plugin.gaussians.lens_camera import LensCamera
 from alpasim_plugin.gaussians.raster import rasterize_lens
 from alpasim_plugin.gaussians.raster.lens_rays import (
-    LENS_BEND,
-    LENS_LEAST,
-    LENS_SMALL,
     tile_rays,
 )
 from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2
 from tests.gaussians.lens_reference import LensReference, least_distance_along
 from tests.gaussians.lens_scenes import (
-    BACK,
+    FINE,
+    HARD,
     HEIGHT,
     LENSES,
     WIDTH,
@@ -35,6 +31,8 @@ from tests.gaussians.lens_scenes import (
     around,
     camera,
     cloud_of,
+    fine_camera,
+    largest_small,
     pose,
     spec,
 )
@@ -81,75 +79,12 @@ def test_pixels_are_those_of_the_definition(name, rolls):
     assert out.alpha[camera(name).visible].mean() > 0.1
 
 
-HARD = {
-    "behind": (around(80, 5) - [0, 0, 12.0], (0.3, 0.2, 0.1)),
-    "at 90 degrees and beyond": (
-        [
-            [3 * np.sin(a), 0.2 * k, 3 * np.cos(a)]
-            for k, a in enumerate(np.deg2rad([85, 90, 95, 105]))
-        ],
-        (0.4, 0.1, 0.3),
-    ),
-    "needles": (around(60, 6), (10.0, 1e-3, 1e-3)),
-    "discs": (around(60, 7, 0.5), (1.0, 1.0, 1e-4)),
-    "flat ones in the plane of a ray": (
-        [[0, 0.0, 4], [0, 0.001, 6], [0.3, 0, 5]],
-        (1.0, 1.0, 1e-6),
-    ),
-    "enclosing": (around(12, 8, 0.2, 1.5), (1.5, 1.0, 0.8)),
-    "large beside the camera": (
-        [[2.0, 0, 0.1], [-1.5, 0.5, -0.5], [0, 1.5, 0.5]],
-        (3.0, 1.0, 0.05),
-    ),
-    "near": (around(60, 9, 0.3, 1.0), (0.05, 0.02, 0.01)),
-}
-
-
 @pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])
 @pytest.mark.parametrize("name", ["opencv", "fisheye", "turning"])
 @pytest.mark.parametrize("case", HARD)
 def test_hard_cases_are_those_of_the_definition(case, name, rolls):
     places, scales = HARD[case]
     check([(cloud_of(places, scales, 0.6, 10), None)], camera(name, rolls), count=80)
-
-
-FINE = {
-    "opencv": (700.0, 30, LensModel("opencv", (-0.1, 0.01, 1e-3, -7e-4))),
-    "fisheye": (400.0, 70, LensModel("fisheye", (0.02, -0.004), max_angle_rad=np.deg2rad(100))),
-    "ftheta": (1.0, 60, LensModel("ftheta", (0.0, 800.0, 0.0, -15.0))),
-}
-
-
-def fine_camera(name, rolls):
-    """Return a part, off the axis, of an image so fine that Gaussians are drawn as ellipses."""
-    focal, off_deg, lens = FINE[name]
-    whole = CameraSpec(name, WIDTH, HEIGHT, np.diag([focal, focal, 1.0]), np.eye(4), 0, lens)
-    off_px = radial_form(whole).radius(np.array([np.deg2rad(off_deg)]))[0]
-    off_px *= np.linalg.norm(radial_form(whole).linear, 2)
-    K = whole.K.copy()
-    K[:2, 2] = 100 - 0.8 * off_px, 75 - 0.6 * off_px
-    seen = CameraSpec(name, 200, 150, K, np.eye(4), 0, lens)
-    if not rolls:
-        return LensCamera(seen, inverse(WORLD))
-    step = 1 / 149
-    time = (0.0, step, -0.5 - 0.5 * step)
-    return LensCamera(seen, inverse(WORLD), Rolling(inverse(WORLD @ BACK), {}, time, 60.0))
-
-
-SHAPES = np.array([[1, 1, 0.02], [1, 0.02, 0.02], [0.5, 0.4, 0.3]])  # discs, needles, others
-
-
-def largest_small(seen, count, seed):
-    """Return Gaussians in an image, as large as ellipses may be, and of any opacity and colour."""
-    rng = np.random.default_rng(seed)
-    rays = seen.rays().reshape(-1, 3)
-    distance = np.exp(rng.uniform(np.log(4), np.log(40), (count, 1)))
-    p = rays[rng.integers(len(rays), size=count)] * distance
-    numbers = tile_rays(seen).lens
-    low_pass = numbers[LENS_BEND] * 0.55 / numbers[LENS_LEAST]
-    most = (numbers[LENS_SMALL] - low_pass) / (1 + numbers[LENS_BEND]) * distance
-    assert (most > 0).all()
-    return cloud_of(p, most * SHAPES[rng.integers(3, size=count)], rng.uniform(0.3, 1, count), seed)
 
 
 @pytest.mark.parametrize("rolls", [False, True], ids=["global", "rolling"])

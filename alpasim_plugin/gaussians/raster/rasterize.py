@@ -19,7 +19,7 @@ MODULES = {
     "triton": "rasterize_triton",
 }
 
-THROUGH_LENSES = ("cpu",)  # backends that draw what a camera with a lens sees
+THROUGH_LENSES = ("cpu", "triton")  # backends that draw what a camera with a lens sees
 
 
 def rasterize(
@@ -34,7 +34,7 @@ def rasterize(
 
     Args:
         cloud: Gaussians in world coordinates.
-        camera: From where; through a lens on the ``cpu`` alone.
+        camera: From where; through a lens with ``cpu`` and ``triton`` alone.
         background: ``(r, g, b)`` or an ``(H, W, 3)`` image behind everything, 0..1.
         backend: ``cpu`` (fast), ``reference`` (float64, slow, the definition), ``torch``
             (that of the differentiable `rasterize_gradient`) or ``triton`` (GPU).
@@ -63,7 +63,7 @@ def rasterize(
     if isinstance(camera, LensCamera) and backend not in THROUGH_LENSES:
         raise InputError(
             f"backend {backend!r}: draws pinholes alone, and this camera has a lens",
-            "use the backend cpu",
+            f"use the backend {' or '.join(THROUGH_LENSES)}",
         )
     module = import_module(f"{__package__}.{MODULES[backend]}")
     return getattr(module, f"rasterize_{backend}")(cloud, camera, background, near_m=near_m)

@@ -71,10 +71,11 @@ def rasterize_prepared(
         )
     behind = background_image(background, camera)
     view = camera_numbers(camera)
-    poses = node_poses([T for _, T in nodes], camera, near_m)
+    T_world_nodes = [T for _, T in nodes]
+    poses = node_poses(T_world_nodes, camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
     if camera.rolling is not None:
-        write_motion(poses, nodes, starts, camera)
+        write_motion(poses, T_world_nodes, starts, camera)
     ends = np.cumsum([prepared.n_input for prepared, _ in nodes])
     parts: list[Part] = [
         (*prepared.arrays(), end - prepared.n_input, pose)

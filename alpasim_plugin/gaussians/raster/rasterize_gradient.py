@@ -52,7 +52,11 @@ from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, bac
 from alpasim_plugin.gaussians.raster.project_kernels import BLOCK_HALF, MARGIN_PX
 from alpasim_plugin.gaussians.raster.raster_kernels import CUT, KEPT
 from alpasim_plugin.gaussians.raster.rasterize_cpu import composite, list_per_tile
-from alpasim_plugin.gaussians.raster.rasterize_triton import TileCompositor, tile_grid
+from alpasim_plugin.gaussians.raster.rasterize_triton import (
+    ProjectedSplats,
+    TileCompositor,
+    tile_grid,
+)
 from alpasim_plugin.gaussians.raster.splats import (
     GradientOutput,
     Splats,
@@ -360,7 +364,7 @@ def _on_gpu(
     rows = records[:, : compositor.kernels.RECORD].contiguous()
     rows[:, PEAK] = log_opacity.exp()
     depths = torch.where(on_screen, records[:, Z], torch.inf)
-    view = compositor.composite(rows, depths, boxes, counts, camera)
+    view = compositor.composite(ProjectedSplats(rows, depths, boxes, counts), camera)
 
     def sums(by_colour: Tensor, by_alpha: Tensor, by_depth: Tensor) -> Tensor:
         by_pixel = torch.cat([by_colour, by_depth[..., None], by_alpha[..., None]], dim=2)

@@ -16,20 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from alpasim_plugin.core.types import F32, F64, I64
-from alpasim_plugin.gaussians.constants import POSE_ANTIALIAS, POSE_SHIFT, POSE_TURN, TILE
+from alpasim_plugin.gaussians.constants import POSE_ANTIALIAS, TILE
 from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster.lens_motion import node_motions
 from alpasim_plugin.gaussians.raster.lens_project_kernels import project_lens_part
 from alpasim_plugin.gaussians.raster.lens_raster_kernels import composite_lens_tiles
-from alpasim_plugin.gaussians.raster.lens_rays import (
-    LENS_SHIFT,
-    MOTION,
-    MOTION_SPEED,
-    MOTION_TURN,
-    TileRays,
-    camera_lens,
-    node_motion,
-    tile_rays,
-)
+from alpasim_plugin.gaussians.raster.lens_rays import MOTION, TileRays, camera_lens, tile_rays
 from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2, LONG, SHORT
 from alpasim_plugin.gaussians.raster.lens_touch_kernels import SQUARES, roll_tiles, split_wide
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
@@ -41,11 +33,9 @@ from alpasim_plugin.gaussians.raster.stages import (
     list_boxes,
     node_poses,
     run_on_threads,
-    write_motion,
 )
 
 WIDE_TILES = 40  # in a larger box the tiles are looked for that a splat touches
-STRAIGHT_RAD = 1e-5  # a road user that turns less in a shutter moves along a line
 
 
 def rasterize_lens(
@@ -85,7 +75,7 @@ class DrawnTiles(NamedTuple):
         splats: Their records.
         tiles: Which of them each tile may show.
         lens: See `lens_rays.camera_lens`.
-        motion: See `_motions`.
+        motion: See `lens_motion.NodeMotions`.
     """
 
     splats: DrawnSplats
@@ -104,9 +94,10 @@ def drawn_splats(
 ) -> DrawnTiles:
     """Project the Gaussians of several prepared clouds and list those that each tile may show."""
     lens = camera_lens(camera)
-    poses = node_poses([T for _, T in nodes], camera, near_m)
+    T_world_nodes = [T for _, T in nodes]
+    poses = node_poses(T_world_nodes, camera, near_m)
     poses[:, POSE_ANTIALIAS] = [prepared.antialias_px2 for prepared, _ in nodes]
-    numbers, moved, motion = _motions(nodes, starts, camera, poses, lens)
+    numbers, moved, motion = node_motions(T_world_nodes, starts, camera, poses, lens)
     size = SHORT if motion is None else LONG
     room = sum(len(prepared.index) for prepared, _ in nodes)
     records = np.empty(room * size, dtype=np.float32)
@@ -214,34 +205,3 @@ def _listed(
     owners = np.concatenate([np.arange(count), owners])
     order = depth_order(keys, ids)
     return list_boxes(order, boxes, camera.width, camera.height, threads, owners)
-
-
-def _motions(
-    nodes: Sequence[Node], starts: Sequence[F64 | None], camera: LensCamera, poses: F64, lens: F64
-) -> tuple[list[int], list[F64], F32 | None]:
-    """Write into the numbers of the nodes' poses how each moves as the camera sees it; return the
-    place of each node's own motion in the world, -1 where it does not turn, by how much the camera
-    moves as each sees it ``(3,)``, and the motions of those that turn; None of a global shutter.
-    """
-    rolling = camera.rolling
-    camera_shift = lens[LENS_SHIFT : LENS_SHIFT + 3].copy()
-    if rolling is None:
-        poses[:, POSE_TURN : POSE_SHIFT + 3] = 0.0
-        return [-1] * len(nodes), [camera_shift] * len(nodes), None
-    write_motion(poses, nodes, starts or [None] * len(nodes), camera)
-    numbers: list[int] = []
-    moved: list[F64] = []
-    motions: list[F32] = []
-    for (_, T), start in zip(nodes, starts or [None] * len(nodes), strict=True):
-        number = -1
-        shift = camera_shift
-        if T is not None and start is not None:
-            motion = node_motion(camera, rolling, np.asarray(T, dtype=np.float64), start)
-            shift = camera_shift - motion[MOTION_SPEED : MOTION_SPEED + 3]
-            if np.linalg.norm(motion[MOTION_TURN : MOTION_TURN + 3]) > STRAIGHT_RAD:
-                number = len(motions)
-                motions.append(motion)
-        numbers.append(number)
-        moved.append(shift)
-    table = np.concatenate(motions) if motions else np.zeros(MOTION, dtype=np.float32)
-    return numbers, moved, table

@@ -4,9 +4,12 @@ State of testing: the kernels are interpreted on the CPU against the reference i
 compiled for GPUs of compute capability 8.0 and 9.0; they have not been run on a GPU.
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,9 +30,12 @@ from alpasim_plugin.gaussians.constants import (
     POSE_ANTIALIAS,
     TILE,
 )
+from alpasim_plugin.gaussians.lens_camera import LensCamera, lens_key
+from alpasim_plugin.gaussians.raster import lens_on_device
 from alpasim_plugin.gaussians.raster.device_output import DeviceOutput
+from alpasim_plugin.gaussians.raster.lens_on_device import PlacedNode
 from alpasim_plugin.gaussians.raster.output import Background, RasterOutput, background_image
-from alpasim_plugin.gaussians.raster.stages import node_poses
+from alpasim_plugin.gaussians.raster.stages import node_poses, write_motion
 
 BLOCK = 128  # Gaussians that one program projects
 CHUNK = 32  # splats after which a tile is tested for being full
@@ -37,17 +43,59 @@ FIRST_CAPACITY = 1 << 16  # pairs of splat and tile for which the first frame ha
 HINT = "Install torch's CUDA build, which brings Triton, or choose --device cpu"
 
 
-def triton_kernels() -> Any:
-    """Return the module of kernels.
+def triton_kernels(name: str = "triton_kernels") -> Any:
+    """Return a module of kernels: those of pinholes, or ``triton_lens_kernels``.
 
     Raises:
         RendererError: Triton is not installed.
     """
     try:
-        from alpasim_plugin.gaussians.raster import triton_kernels as kernels
+        return import_module(f"{__package__}.{name}")
     except ImportError as error:
         raise RendererError(f"the package triton does not import ({error})", HINT) from error
-    return kernels
+
+
+class ProjectedSplats(NamedTuple):
+    """What a device projected.
+
+    Attributes:
+        records: ``(N, RECORD)``, through a lens ``(N, SHORT)`` or ``(N, LONG)`` of `lens_records`.
+        depths: ``(N,)``, by which they are drawn.
+        boxes: ``(N, BOX)``; the tiles of a view stand below those of the view before.
+        counts: ``(N,)`` int32, tiles of each; 0 for what is not drawn.
+    """
+
+    records: Tensor
+    depths: Tensor
+    boxes: Tensor
+    counts: Tensor
+
+
+class SplatLists(NamedTuple):
+    """Splats by tile; see `TiledImage`."""
+
+    order: Tensor
+    ends: Tensor
+    splats: Tensor
+    places: Tensor
+    starts: Tensor
+
+
+class LensTensors(NamedTuple):
+    """The lens of some views on a device.
+
+    Attributes:
+        rays: See `lens_on_device.rays_on_device`.
+        lenses, motions: See `lens_on_device.LensNumbers`.
+        rolls: Whether the shutters roll.
+        length: Numbers of a record.
+    """
+
+    rays: Tensor
+    lenses: Tensor
+    motions: Tensor
+    rolls: bool
+    length: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,39 +145,59 @@ class TileCompositor:
 
     def composite(
         self,
-        records: Tensor,
-        depths: Tensor,
-        boxes: Tensor,
-        counts: Tensor,
-        camera: PinholeCamera,
+        splats: ProjectedSplats,
+        camera: PinholeCamera | LensCamera,
         views: int = 1,
+        lens: LensTensors | None = None,
     ) -> TiledImage:
         """Blend projected splats; the views are whole if their pairs are at most `capacity`.
 
         Args:
-            records: ``(N, RECORD)``.
-            depths: ``(N,)``.
-            boxes: ``(N, BOX)``; the tiles of a view stand below those of the view before.
-            counts: ``(N,)`` int32, tiles of each; 0 for what is not drawn.
+            splats: See `ProjectedSplats`.
             camera: Gives the images' size.
             views: Their number.
+            lens: That of all views; None: they are pinholes.
         """
-        kernels, width, height = self.kernels, camera.width, camera.height
+        width = camera.width
+        height = camera.height
         tiles_x, tiles_y = tile_grid(camera)
-        total = len(records)
-        tile_count = views * tiles_x * tiles_y
-        order = torch.sort(depths, stable=True).indices
-        ends = torch.cumsum(counts[order], dim=0)
+        listed = self._listed(splats, views * tiles_x * tiles_y, tiles_x)
+        image = self._empty((views, height, width, self.kernels.PIXEL), torch.float32)
+        grid = (views * tiles_x * tiles_y,)
+        size = width, height, tiles_x, tiles_y
+        lists = splats.records, listed.splats, listed.starts
+        if lens is None:
+            self.kernels.composite[grid](*lists, image, *size, TILE=TILE, CHUNK=CHUNK)
+        else:
+            triton_kernels("triton_lens_kernels").composite_lens[grid](
+                *lists,
+                lens.rays,
+                lens.lenses,
+                lens.motions,
+                image,
+                *size,
+                TILE=TILE,
+                CHUNK=CHUNK,
+                LENGTH=lens.length,
+                ROLLS=lens.rolls,
+            )
+        return TiledImage(image, splats.records, *listed)
+
+    def _listed(self, splats: ProjectedSplats, tile_count: int, tiles_x: int) -> SplatLists:
+        """List splats by tile, the nearest first."""
+        total = len(splats.records)
+        order = torch.sort(splats.depths, stable=True).indices
+        ends = torch.cumsum(splats.counts[order], dim=0)
         tiles = torch.full((self.capacity,), tile_count, dtype=torch.int32, device=self.device)
-        splats = torch.zeros_like(tiles)
+        numbers = torch.zeros_like(tiles)
         if total:
-            kernels.list_tiles[(-(-total // BLOCK),)](
+            self.kernels.list_tiles[(-(-total // BLOCK),)](
                 order,
                 ends,
-                boxes,
-                counts,
+                splats.boxes,
+                splats.counts,
                 tiles,
-                splats,
+                numbers,
                 total,
                 self.capacity,
                 tiles_x,
@@ -138,21 +206,7 @@ class TileCompositor:
         sorted_tiles, places = torch.sort(tiles, stable=True)
         tile_numbers = torch.arange(tile_count + 1, dtype=torch.int32, device=self.device)
         starts = torch.searchsorted(sorted_tiles, tile_numbers).to(torch.int32)
-        splats = splats[places]
-        image = self._empty((views, height, width, kernels.PIXEL), torch.float32)
-        kernels.composite[(tile_count,)](
-            records,
-            splats,
-            starts,
-            image,
-            width,
-            height,
-            tiles_x,
-            tiles_y,
-            TILE=TILE,
-            CHUNK=CHUNK,
-        )
-        return TiledImage(image, records, order, ends, splats, places, starts)
+        return SplatLists(order, ends, numbers[places], places, starts)
 
     def gradient(self, view: TiledImage, by_pixel: Tensor, columns: int) -> Tensor:
         """Return the sums ``(N, columns)`` of `triton_kernels.composite_backward` over the tiles of
@@ -191,7 +245,7 @@ def compositor_of(device: str) -> TileCompositor | None:
     return implementation(device, lambda _: None, TileCompositor)(device)
 
 
-def tile_grid(camera: PinholeCamera) -> tuple[int, int]:
+def tile_grid(camera: PinholeCamera | LensCamera) -> tuple[int, int]:
     """Return how many tiles an image has in a row and in a column."""
     return -(-camera.width // TILE), -(-camera.height // TILE)
 
@@ -202,10 +256,18 @@ class DrawnCloud(NamedTuple):
     cloud: int  # its place among those uploaded
     T_world_node: FloatArray | None = None  # (4, 4); None: the identity
     antialiased: bool = False  # drawn with a filter that it may lack
+    T_world_start: F64 | None = None  # of a rolling shutter at its start; None: it stands
 
 
 # From where, and what; equal depths are drawn in this order.
-CloudView = tuple[PinholeCamera, Sequence[DrawnCloud]]
+CloudView = tuple[PinholeCamera | LensCamera, Sequence[DrawnCloud]]
+
+
+def drawn_together(camera: PinholeCamera | LensCamera) -> Hashable:
+    """Return what cameras share whose views are drawn in one launch: their size, and their lens."""
+    if isinstance(camera, LensCamera):
+        return lens_key(camera.spec), camera.rolling is not None
+    return camera.height, camera.width
 
 
 class UploadedClouds(TileCompositor):
@@ -250,7 +312,7 @@ class UploadedClouds(TileCompositor):
     def draw(
         self, views: Sequence[CloudView], behind: Tensor, near_m: float = NEAR_M
     ) -> list[DeviceOutput]:
-        """Render views of one size, whose images stay on the device.
+        """Render views that share what `drawn_together` says; their images stay on the device.
 
         Args:
             views: Cameras, and clouds at rigid poses.
@@ -285,48 +347,100 @@ class UploadedClouds(TileCompositor):
 
     def _image(self, views: Sequence[CloudView], near_m: float) -> tuple[Tensor, Tensor]:
         """Return the composited images of the views, and the number of pairs of splat and tile."""
-        kernels = self.kernels
-        poses = np.concatenate([self._poses(*view, near_m) for view in views])
-        numbers = [
-            [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
-            for camera, _ in views
-        ]
-        sent = upload_together([poses, np.array(numbers)], self.device)
+        camera = views[0][0]
         spans = self._spans(views)
-        total = len(spans) * BLOCK
-        records = self._empty((total, kernels.RECORD), torch.float32)
-        depths = self._empty((total,), torch.float32)
-        boxes = self._empty((total, kernels.BOX), torch.int32)
-        counts = self._empty((total,), torch.int32)
-        if total:
-            kernels.project[(len(spans),)](
+        if isinstance(camera, LensCamera):
+            splats, lens = self._projected_through_lens(views, spans, near_m)
+        else:
+            splats = self._projected(views, spans, near_m)
+            lens = None
+        batch = self.composite(splats, camera, len(views), lens)
+        return batch.image, splats.counts.sum(dtype=torch.int32)
+
+    def _projected(
+        self, views: Sequence[CloudView], spans: npt.NDArray[np.int32], near_m: float
+    ) -> ProjectedSplats:
+        """Project the Gaussians that pinholes may see."""
+        poses = [self._poses(*view, near_m) for view in views]
+        cameras = np.array([_pinhole_numbers(camera) for camera, _ in views])
+        sent = upload_together([np.concatenate(poses), cameras], self.device)
+        splats = self._room(len(spans), self.kernels.RECORD)
+        if len(spans):
+            self.kernels.project[(len(spans),)](
                 self._upload(spans, np.int32),
                 *sent,
-                self.means,
-                self.factors,
-                self.opacities,
-                self.extents,
-                self.sh,
-                records,
-                depths,
-                boxes,
-                counts,
+                *self._clouds(),
+                *splats,
                 near_m,
                 *tile_grid(views[0][0]),
                 SIZE=self.sh_size,
                 TILE=TILE,
                 BLOCK=BLOCK,
             )
-        batch = self.composite(records, depths, boxes, counts, views[0][0], len(views))
-        return batch.image, counts.sum(dtype=torch.int32)
+        return splats
 
-    def _poses(self, camera: PinholeCamera, nodes: Sequence[DrawnCloud], near_m: float) -> F64:
-        """Return the poses of a view's nodes ``(N, POSE)``."""
-        poses = node_poses([node.T_world_node for node in nodes], camera, near_m)
-        poses[:, POSE_ANTIALIAS] = [
-            MIP_PX2 if node.antialiased else self.antialias_px2[node.cloud] for node in nodes
+    def _projected_through_lens(
+        self, views: Sequence[CloudView], spans: npt.NDArray[np.int32], near_m: float
+    ) -> tuple[ProjectedSplats, LensTensors]:
+        """Project the Gaussians that cameras with a lens may see."""
+        placed = [
+            (lens_on_device.with_lens(camera), list(map(self._placed, nodes)))
+            for camera, nodes in views
         ]
-        return poses[:, : self.kernels.POSE]
+        camera, _ = placed[0]
+        numbers = lens_on_device.lens_numbers(placed, near_m)
+        poses, lenses, motions = upload_together(list(numbers), self.device)
+        rolls = camera.rolling is not None
+        length = lens_on_device.record_length(rolls)
+        rays = lens_on_device.rays_on_device(camera.spec, str(self.device))
+        splats = self._room(len(spans), length)
+        if len(spans):
+            triton_kernels("triton_lens_kernels").project_lens[(len(spans),)](
+                self._upload(spans, np.int32),
+                poses,
+                lenses,
+                motions,
+                *self._clouds(),
+                *splats,
+                *tile_grid(camera),
+                SIZE=self.sh_size,
+                TILE=TILE,
+                BLOCK=BLOCK,
+                LENGTH=length,
+                ROLLS=rolls,
+                BENDS=lens_on_device.bends(numbers.lenses[0]),
+            )
+        return splats, LensTensors(rays, lenses, motions, rolls, length)
+
+    def _placed(self, node: DrawnCloud) -> PlacedNode:
+        return PlacedNode(node.T_world_node, node.T_world_start, self._antialias_px2(node))
+
+    def _clouds(self) -> tuple[Tensor, ...]:
+        return self.means, self.factors, self.opacities, self.extents, self.sh
+
+    def _room(self, blocks: int, length: int) -> ProjectedSplats:
+        """Return room for what blocks of Gaussians are projected to."""
+        total = blocks * BLOCK
+        return ProjectedSplats(
+            self._empty((total, length), torch.float32),
+            self._empty((total,), torch.float32),
+            self._empty((total, self.kernels.BOX), torch.int32),
+            self._empty((total,), torch.int32),
+        )
+
+    def _poses(
+        self, camera: PinholeCamera | LensCamera, nodes: Sequence[DrawnCloud], near_m: float
+    ) -> F64:
+        """Return the poses of a view's nodes ``(N, POSE)``."""
+        T_world_nodes = [node.T_world_node for node in nodes]
+        poses = node_poses(T_world_nodes, camera, near_m)
+        poses[:, POSE_ANTIALIAS] = list(map(self._antialias_px2, nodes))
+        if camera.rolling is not None:
+            write_motion(poses, T_world_nodes, [node.T_world_start for node in nodes], camera)
+        return poses
+
+    def _antialias_px2(self, node: DrawnCloud) -> float:
+        return MIP_PX2 if node.antialiased else self.antialias_px2[node.cloud]
 
     def _spans(self, views: Sequence[CloudView]) -> npt.NDArray[np.int32]:
         """Return the table of blocks ``(B, SPAN)``: node among those of all views, first Gaussian,
@@ -347,6 +461,14 @@ class UploadedClouds(TileCompositor):
         return upload(np.asarray(array, dtype=dtype), self.device)
 
 
+def _pinhole_numbers(camera: PinholeCamera | LensCamera) -> list[float]:
+    """Return a pinhole as `triton_kernels.project` reads it."""
+    assert isinstance(camera, PinholeCamera), "views of one launch are all pinholes, or none is"
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.slope_limits()]
+    rolling = camera.rolling
+    return [*numbers, *((0.0, 0.0, 0.0, 0.0) if rolling is None else (*rolling.time, 1.0))]
+
+
 def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.NDArray[Any]:
     """Return arrays of rows of a shape as one, also where there is none."""
     return np.concatenate([np.zeros((0, *shape)), *arrays])
@@ -354,7 +476,7 @@ def _joined(arrays: Sequence[npt.NDArray[Any]], shape: tuple[int, ...]) -> npt.N
 
 def rasterize_triton(
     cloud: GaussianCloud,
-    camera: PinholeCamera,
+    camera: PinholeCamera | LensCamera,
     background: Background = (0.0, 0.0, 0.0),
     *,
     near_m: float = NEAR_M,

@@ -34,7 +34,6 @@ from alpasim_plugin.gaussians.constants import (
     TILE,
 )
 from alpasim_plugin.gaussians.raster.binning import count_tiles, fill_tiles, sorted_numbers
-from alpasim_plugin.gaussians.raster.prepared import Node
 
 WORTH_THREADS = 4096  # splats; below, waking a second thread costs more than it saves
 _IDENTITY = np.eye(4)
@@ -76,13 +75,16 @@ def node_poses(
 
 
 def write_motion(
-    poses: F64, nodes: Sequence[Node], starts: Sequence[F64 | None], camera: Posed
+    poses: F64,
+    T_world_nodes: Sequence[FloatArray | None],
+    starts: Sequence[F64 | None],
+    camera: Posed,
 ) -> None:
     """Write into the numbers of the nodes' poses how each moves while the shutter rolls; a node
     without both poses stands.
     """
     still = camera.motion(_IDENTITY, _IDENTITY)
-    for pose, (_, T), T_start in zip(poses, nodes, starts, strict=True):
+    for pose, T, T_start in zip(poses, T_world_nodes, starts, strict=True):
         if T is None or T_start is None:
             pose[POSE_TURN:] = still
         else:

@@ -15,8 +15,9 @@ import triton.language as tl
 
 from alpasim_plugin.gaussians import constants, sh
 
-POSE = 13  # float64 per node: rotation node to camera by rows, camera centre in it, its 2D filter
-CAMERA = 8  # float64: fx, fy, cx, cy, slope limits low x, high x, low y, high y
+# float64 per camera: fx, fy, cx, cy, slope limits low x, high x, low y, high y, the time (a, b, c) of a
+# pixel while a shutter rolls, as of `camera.Rolling`, and whether it does
+CAMERA = 12
 RECORD = 12  # float32 per splat: u, v, L11, L12, L22, opacity, r, g, b, z, half width, half height
 SPAN = 4  # int32 per block of Gaussians: node, first, number, view
 BOX = 4  # int32 per splat: first and last + 1 tile column, first and last + 1 tile row
@@ -26,6 +27,12 @@ _EPS2D_PX2 = tl.constexpr(constants.EPS2D_PX2)
 _ALPHA_MIN = tl.constexpr(constants.ALPHA_MIN)
 _ALPHA_MAX = tl.constexpr(constants.ALPHA_MAX)
 _STOP = tl.constexpr(constants.TRANSMITTANCE_STOP)
+_POSE = tl.constexpr(constants.POSE_SIZE)
+_ANTIALIAS = tl.constexpr(constants.POSE_ANTIALIAS)
+_TURN = tl.constexpr(constants.POSE_TURN)
+_CAMERA = tl.constexpr(CAMERA)
+_TIME = tl.constexpr(8)
+_LEAST_M = tl.constexpr(1e-3)  # depth of what is seen through a rolling shutter
 _FAR_M = tl.constexpr(constants.FAR_M)
 _MARGIN_PX = tl.constexpr(0.01)  # boxes grow by it: rounding never cuts a pixel that is drawn
 _C0 = tl.constexpr(sh.C0)
@@ -35,7 +42,7 @@ _C30, _C31, _C32, _C33, _C34 = (tl.constexpr(value) for value in sh.C3)
 
 
 @triton.jit
-def _colour(sh_ptr, offset, visible, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.constexpr):
+def colour(sh_ptr, offset, visible, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.constexpr):
     """Return one colour channel of splats seen along unit directions, 0 where it would be less.
 
     ``offset`` is the first coefficient of each splat; the order is that of `sh.sh_terms`.
@@ -66,12 +73,43 @@ def _colour(sh_ptr, offset, visible, x, y, z, CHANNEL: tl.constexpr, SIZE: tl.co
 
 
 @triton.jit
-def _tiles(low, high, count, TILE: tl.constexpr):
+def tiles_between(low, high, count, TILE: tl.constexpr):
     """Return the first tile and the last + 1 that pixels ``low`` to ``high`` meet, in 0..count."""
     # Clamped as floats: a splat at 1e30 pixels has no tile number.
     first = tl.minimum(tl.maximum(tl.floor(low / TILE), 0.0), count).to(tl.int32)
     last = tl.minimum(tl.maximum(tl.floor(high / TILE), -1.0), count - 1.0).to(tl.int32) + 1
     return first, last
+
+
+@triton.jit
+def _at_its_time(x, y, z, motion, camera):
+    """Return where points are, in camera axes, when the pixel that shows them is exposed; see
+    `project_kernels`.
+
+    A point moves by ``turn x p + shift`` in a shutter, to second order.
+    """
+    turn_x = tl.load(motion)
+    turn_y = tl.load(motion + 1)
+    turn_z = tl.load(motion + 2)
+    first_x = turn_y * z - turn_z * y + tl.load(motion + 3)
+    first_y = turn_z * x - turn_x * z + tl.load(motion + 4)
+    first_z = turn_x * y - turn_y * x + tl.load(motion + 5)
+    second_x = 0.5 * (turn_y * first_z - turn_z * first_y)
+    second_y = 0.5 * (turn_z * first_x - turn_x * first_z)
+    second_z = 0.5 * (turn_x * first_y - turn_y * first_x)
+    at_x = x
+    at_y = y
+    at_z = z
+    for _ in tl.static_range(3):
+        inverse_z = 1.0 / tl.maximum(at_z, _LEAST_M)
+        u = tl.load(camera) * at_x * inverse_z + tl.load(camera + 2)
+        v = tl.load(camera + 1) * at_y * inverse_z + tl.load(camera + 3)
+        time = tl.load(camera + _TIME) * u + tl.load(camera + _TIME + 1) * v
+        time = tl.minimum(tl.maximum(time + tl.load(camera + _TIME + 2), -0.5), 0.5)
+        at_x = x + time * (first_x + time * second_x)
+        at_y = y + time * (first_y + time * second_y)
+        at_z = z + time * (first_z + time * second_z)
+    return at_x, at_y, tl.maximum(at_z, _LEAST_M)
 
 
 @triton.jit
@@ -107,9 +145,9 @@ def project(
     present = lane < tl.load(spans + block * 4 + 2)
     i = (tl.load(spans + block * 4 + 1) + lane).to(tl.int64)
     view = tl.load(spans + block * 4 + 3)
-    camera += view * 8
+    camera += view * _CAMERA
     above = view * tiles_y
-    pose = poses + node * 13
+    pose = poses + node * _POSE
     r00 = tl.load(pose)
     r01 = tl.load(pose + 1)
     r02 = tl.load(pose + 2)
@@ -128,6 +166,8 @@ def project(
     opacity = tl.load(opacities + i, present, 0.0)
     visible = present & (z >= near_m) & (z <= _FAR_M) & (opacity >= _ALPHA_MIN)
     z = tl.where(visible, z, 1.0)
+    if tl.load(camera + _TIME + 3) > 0:
+        x, y, z = _at_its_time(x, y, z, pose + _TURN, camera)
     fx = tl.load(camera)
     fy = tl.load(camera + 1)
     slope_x = x / z
@@ -163,7 +203,7 @@ def project(
     n2 = jy0 * f02 + jy1 * f12 + jy2 * f22
     mm = m0 * m0 + m1 * m1 + m2 * m2
     nn = n0 * n0 + n1 * n1 + n2 * n2
-    antialias = tl.load(pose + 12).to(tl.float32)
+    antialias = tl.load(pose + _ANTIALIAS).to(tl.float32)
     eps = tl.where(antialias > 0, antialias, _EPS2D_PX2)
     c11 = mm + eps
     c22 = nn + eps
@@ -185,8 +225,10 @@ def project(
     toward_x = (dx / distance).to(tl.float32)
     toward_y = (dy / distance).to(tl.float32)
     toward_z = (dz / distance).to(tl.float32)
-    x0, x1 = _tiles(u - half_width - _MARGIN_PX, u + half_width + _MARGIN_PX, tiles_x, TILE)
-    y0, y1 = _tiles(v - half_height - _MARGIN_PX, v + half_height + _MARGIN_PX, tiles_y, TILE)
+    x0, x1 = tiles_between(u - half_width - _MARGIN_PX, u + half_width + _MARGIN_PX, tiles_x, TILE)
+    y0, y1 = tiles_between(
+        v - half_height - _MARGIN_PX, v + half_height + _MARGIN_PX, tiles_y, TILE
+    )
     count = tl.maximum(x1 - x0, 0) * tl.maximum(y1 - y0, 0)
     count = tl.where(visible, count, 0)
     slot = block * BLOCK + lane
@@ -207,17 +249,17 @@ def project(
     sh_offset = i * (SIZE * 3)
     tl.store(
         record + 6,
-        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 0, SIZE),
+        colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 0, SIZE),
         on_screen,
     )
     tl.store(
         record + 7,
-        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 1, SIZE),
+        colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 1, SIZE),
         on_screen,
     )
     tl.store(
         record + 8,
-        _colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 2, SIZE),
+        colour(sh_ptr, sh_offset, on_screen, toward_x, toward_y, toward_z, 2, SIZE),
         on_screen,
     )
     tl.store(record + 9, z.to(tl.float32), on_screen)
@@ -250,11 +292,35 @@ def list_tiles(
 
 
 @triton.jit
-def _pixels(tile, tiles_x, TILE: tl.constexpr):
+def pixels_of(tile, tiles_x, TILE: tl.constexpr):
     """Return the columns and the rows of a tile's pixels."""
     column = (tile % tiles_x) * TILE + tl.arange(0, TILE)[None, :]
     row = (tile // tiles_x) * TILE + tl.arange(0, TILE)[:, None]
     return tl.broadcast(column, row)
+
+
+@triton.jit
+def ellipse_q2(record, px, py):
+    """Return the squared distance of pixels from a splat's middle, in standard deviations."""
+    dx = px - tl.load(record)
+    dy = py - tl.load(record + 1)
+    s = tl.load(record + 2) * dx + tl.load(record + 3) * dy
+    t = tl.load(record + 4) * dy
+    return s * s + t * t
+
+
+@triton.jit
+def layer(alpha, transmittance, open_):
+    """Return where a layer of an opacity is drawn, with which weight, what is seen through it and which
+    pixels are open behind it: the splat that would close a pixel is left out, and so is all behind it.
+    """
+    alpha = tl.minimum(alpha, _ALPHA_MAX)
+    visible = (alpha >= _ALPHA_MIN) & open_
+    after = transmittance * (1.0 - alpha)
+    open_ = open_ & ~(visible & (after <= _STOP))
+    visible = visible & open_
+    weight = tl.where(visible, alpha * transmittance, 0.0)
+    return visible, weight, tl.where(visible, after, transmittance), open_
 
 
 @triton.jit
@@ -275,7 +341,7 @@ def composite(
     """
     tile = tl.program_id(0)
     tiles = tiles_x * tiles_y
-    column, row = _pixels(tile % tiles, tiles_x, TILE)
+    column, row = pixels_of(tile % tiles, tiles_x, TILE)
     image += (tile // tiles).to(tl.int64) * (height * width * 6)
     px = column.to(tl.float32) + 0.5
     py = row.to(tl.float32) + 0.5
@@ -294,23 +360,12 @@ def composite(
         stop = tl.minimum(begin + CHUNK, end)
         for k in range(begin, stop):
             record = records + tl.load(splats + k).to(tl.int64) * 12
-            dx = px - tl.load(record)
-            dy = py - tl.load(record + 1)
-            s = tl.load(record + 2) * dx + tl.load(record + 3) * dy
-            t = tl.load(record + 4) * dy
-            alpha = tl.load(record + 5) * tl.exp(-0.5 * (s * s + t * t))
-            alpha = tl.minimum(alpha, _ALPHA_MAX)
-            visible = (alpha >= _ALPHA_MIN) & open_
-            after = transmittance * (1.0 - alpha)
-            # The splat that would close a pixel is left out, and so is all behind it.
-            open_ = open_ & ~(visible & (after <= _STOP))
-            visible = visible & open_
-            weight = tl.where(visible, alpha * transmittance, 0.0)
+            alpha = tl.load(record + 5) * tl.exp(-0.5 * ellipse_q2(record, px, py))
+            visible, weight, transmittance, open_ = layer(alpha, transmittance, open_)
             red += weight * tl.load(record + 6)
             green += weight * tl.load(record + 7)
             blue += weight * tl.load(record + 8)
             depth += weight * tl.load(record + 9)
-            transmittance = tl.where(visible, after, transmittance)
             last = tl.where(visible, k + 1 - first, last)
         begin = stop
         if tl.max(open_.to(tl.int32)) == 0:
@@ -346,7 +401,7 @@ def composite_backward(
     the row of each entry of ``splats``.
     """
     tile = tl.program_id(0)
-    column, row = _pixels(tile, tiles_x, TILE)
+    column, row = pixels_of(tile, tiles_x, TILE)
     px = column.to(tl.float32) + 0.5
     py = row.to(tl.float32) + 0.5
     inside = (column < width) & (row < height)

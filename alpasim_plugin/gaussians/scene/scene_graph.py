@@ -29,7 +29,7 @@ import numpy as np
 
 from alpasim_plugin.core.detail import halvings_of
 from alpasim_plugin.core.devices import batched, implementation
-from alpasim_plugin.core.errors import InputError, RendererError
+from alpasim_plugin.core.errors import RendererError
 from alpasim_plugin.core.types import F64, I64, Bool, CameraSpec, FloatArray
 from alpasim_plugin.gaussians.camera import PinholeCamera
 from alpasim_plugin.gaussians.cloud import GaussianCloud, placed_cloud
@@ -279,10 +279,8 @@ class SceneGraph:
             if choice.antialiased:
                 prepared = replace(prepared, antialias_px2=MIP_PX2)
             nodes.append((prepared, choice.T_world_node))
-        starts: list[F64 | None] = []
-        if camera.rolling is not None:
-            starts = [camera.rolling.actors_start.get(choice.node.name) for choice in chosen]
         behind = self.sky.image(camera)
+        starts = _starts(camera, chosen)
         return rasterize_prepared(nodes, camera, behind, threads=threads, starts=starts)
 
     def _draw_on_card(
@@ -291,15 +289,21 @@ class SceneGraph:
         held: tuple[SceneNode, ...],
         views: Sequence[tuple[Camera, Sequence[ChosenNode]]],
     ) -> list[DeviceOutput]:
-        from alpasim_plugin.gaussians.raster.rasterize_triton import CloudView, DrawnCloud
+        from alpasim_plugin.gaussians.raster.rasterize_triton import (
+            CloudView,
+            DrawnCloud,
+            drawn_together,
+        )
 
         _, clouds, place = self._upload(device, held)
         placed = [
             (
-                pinhole_of(camera),
+                camera,
                 [
-                    DrawnCloud(place[node.name, level], T, antialiased)
-                    for node, level, T, antialiased in chosen
+                    DrawnCloud(place[node.name, level], T, antialiased, start)
+                    for (node, level, T, antialiased), start in zip(
+                        chosen, _starts(camera, chosen), strict=True
+                    )
                 ],
             )
             for camera, chosen in views
@@ -308,7 +312,7 @@ class SceneGraph:
         def draw(batch: Sequence[CloudView]) -> list[DeviceOutput]:
             return clouds.draw(batch, self.sky.on_device([camera for camera, _ in batch], device))
 
-        return batched(placed, lambda view: (view[0].height, view[0].width), draw)
+        return batched(placed, lambda view: drawn_together(view[0]), draw)
 
     def _choose(
         self,
@@ -398,25 +402,18 @@ def _level(node: SceneNode, allowed_m: float, halvings: int) -> int | None:
     return level_numbers[0] if level_numbers else None
 
 
+def _starts(camera: Camera, chosen: Sequence[ChosenNode]) -> list[F64 | None]:
+    """Return where nodes were at the start of a rolling shutter; None: they stand."""
+    if camera.rolling is None:
+        return [None] * len(chosen)
+    return [camera.rolling.actors_start.get(choice.node.name) for choice in chosen]
+
+
 def posed(spec: CameraSpec, T_world_camera: F64) -> Camera:
     """Return a camera at a pose ``(4, 4)``, with its lens if it has one."""
     if spec.lens is not None:
         return LensCamera.from_pose(spec, T_world_camera)
     return PinholeCamera.from_pose(spec.width, spec.height, spec.K, T_world_camera)
-
-
-def pinhole_of(camera: Camera) -> PinholeCamera:
-    """Return a camera that a card is to draw.
-
-    Raises:
-        InputError: It has a lens, which the CPU alone draws.
-    """
-    if isinstance(camera, LensCamera):
-        raise InputError(
-            "a camera with a lens: a card draws pinholes alone",
-            "use --device cpu, or draw the pinholes that cover the lens",
-        )
-    return camera
 
 
 def in_view(camera: Camera, centre: F64, radius: F64) -> Bool:

@@ -94,28 +94,22 @@ class Sky:
         columns += np.float32(WIDTH) * (columns < 0)
         return cv2.remap(self._panorama, columns, np.clip(rows, 0, HEIGHT - 1), cv2.INTER_LINEAR)
 
-    def on_device(self, cameras: Sequence[PinholeCamera], device: str) -> Tensor:
-        """Return `image` of cameras of one size ``(V, H, W, 3)`` as a tensor of a device, which
-        receives the panorama once.
+    def on_device(self, cameras: Sequence[PinholeCamera | LensCamera], device: str) -> Tensor:
+        """Return `image` of cameras that are drawn together ``(V, H, W, 3)`` as a tensor of a device,
+        which receives the panorama once; through a lens directions are computed at every pixel.
         """
-        import torch
         import torch.nn.functional as F
 
         if device not in self._uploaded:
             parts = self._panorama.transpose(2, 0, 1), PX_PER_RAD, 2 / SPAN_PX
             self._uploaded[device] = [upload(part, device) for part in parts]
         panorama, px_per_rad, shares = self._uploaded[device]
+        first = cameras[0]
         numbers = upload(np.stack([_seen_from(camera) for camera in cameras]), device)
-        height = cameras[0].height
-        width = cameras[0].width
-        corners = _corners(height, width, device)
-        x, y, z = (numbers[:, :9].view(-1, 3, 3) @ corners.flatten(1)).unbind(1)
-        angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
-        places = torch.addcmul(numbers[:, None, 9:], angles, px_per_rad).float().mT
-        coarse = places.reshape(-1, 2, *corners.shape[1:])
-        finer = F.interpolate(coarse, scale_factor=STEP_PX, mode="bilinear", align_corners=False)
-        first = STEP_PX // 2
-        window = finer[:, :, first : first + height, first : first + width]
+        if isinstance(first, LensCamera):
+            window = _lens_places_on_device(numbers, first, device, px_per_rad)
+        else:
+            window = _pinhole_places_on_device(numbers, first, device, px_per_rad)
         # OpenCV interpolates at the nearest 32nd of a pixel.
         window = (window * PARTS).round_().div_(PARTS)
         window[:, 0].remainder_(WIDTH)
@@ -190,14 +184,78 @@ def _spread(grid: F64) -> F64:
     return np.ptp(cells, axis=0)
 
 
-def _seen_from(camera: PinholeCamera) -> F64:
-    """Return the matrix from pixels to rays whose x is ahead, and the place of its origin in the
-    panorama: nine numbers and two.
+def _seen_from(camera: PinholeCamera | LensCamera) -> F64:
+    """Return how a camera sees the panorama: the matrix from its pixels, of a lens from its rays, to rays
+    whose x is ahead, nine numbers; the place of its origin in the panorama, two; of a rolling shutter
+    the time (a, b, c) of a pixel, and the matrix that turns rays in a shutter, before the first.
     """
     ahead = math.atan2(*camera.T_camera_world[2, 1::-1])
     T_camera_ahead = camera.T_camera_world[:3, :3] @ se2(0, 0, ahead)[:3, :3]
-    rays = T_camera_ahead.T @ np.linalg.inv(camera.K)
-    return np.concatenate([rays.ravel(), np.array([ahead, -HIGH_RAD]) * PX_PER_RAD])
+    to_rays = np.eye(3) if isinstance(camera, LensCamera) else np.linalg.inv(camera.K)
+    time = np.zeros(3)
+    turned = np.zeros((3, 3))
+    if camera.rolling is not None:
+        time = np.array(camera.rolling.time)
+        turn = camera.motion(np.eye(4), np.eye(4))[:3]
+        turned = -np.cross(turn, np.eye(3)).T @ to_rays
+    still = T_camera_ahead.T @ to_rays
+    place = np.array([ahead, -HIGH_RAD]) * PX_PER_RAD
+    return np.concatenate([still.ravel(), place, time, (T_camera_ahead.T @ turned).ravel()])
+
+
+def _places_on_device(numbers: Tensor, pixels: Tensor, rays: Tensor, px_per_rad: Tensor) -> Tensor:
+    """Return columns and rows of the panorama ``(V, 2, P)``, float32.
+
+    Args:
+        numbers: ``(V, 23)`` of `_seen_from`.
+        pixels: ``(3, P)``: u, v, 1.
+        rays: ``(3, P)`` in the axes that the numbers are of.
+        px_per_rad: `PX_PER_RAD`.
+    """
+    import torch
+
+    time = (numbers[:, None, 11:14] @ pixels).clamp(-0.5, 0.5)
+    seen = numbers[:, :9].view(-1, 3, 3) @ rays
+    seen = seen + time * (numbers[:, 14:].view(-1, 3, 3) @ rays)
+    x, y, z = seen.unbind(1)
+    angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
+    return torch.addcmul(numbers[:, None, 9:11], angles, px_per_rad).float().mT
+
+
+def _pinhole_places_on_device(
+    numbers: Tensor, camera: PinholeCamera, device: str, px_per_rad: Tensor
+) -> Tensor:
+    """Return `_places_on_device` at every pixel ``(V, 2, H, W)``, computed at `_corners` and
+    interpolated in between.
+    """
+    import torch.nn.functional as F
+
+    corners = _corners(camera.height, camera.width, device)
+    flat = corners.flatten(1)
+    places = _places_on_device(numbers, flat, flat, px_per_rad)
+    coarse = places.reshape(-1, 2, *corners.shape[1:])
+    finer = F.interpolate(coarse, scale_factor=STEP_PX, mode="bilinear", align_corners=False)
+    first = STEP_PX // 2
+    return finer[:, :, first : first + camera.height, first : first + camera.width]
+
+
+def _lens_places_on_device(
+    numbers: Tensor, camera: LensCamera, device: str, px_per_rad: Tensor
+) -> Tensor:
+    """Return `_places_on_device` at every pixel of a lens ``(V, 2, H, W)``."""
+    from alpasim_plugin.gaussians.raster.lens_on_device import rays_on_device
+
+    pixels = _pixels(camera.height, camera.width, device)
+    rays = rays_on_device(camera.spec, device)[:3].flatten(1)
+    places = _places_on_device(numbers.float(), pixels, rays, px_per_rad.float())
+    return places.reshape(-1, 2, camera.height, camera.width)
+
+
+@lru_cache(maxsize=8)
+def _pixels(height: int, width: int, device: str) -> Tensor:
+    """Return the middles of an image's pixels on a device ``(3, P)``: u, v, 1."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return upload(np.stack([u, v, np.ones_like(u)]).reshape(3, -1).astype(np.float32), device)
 
 
 def _steps(size: int) -> I64:
