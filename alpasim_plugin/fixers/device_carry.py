@@ -1,5 +1,5 @@
 """Carry recorded frames into a view on a GPU: what `fixers.ground` does, with tensors, and without
-waiting for them. Only the first rows of the ground may differ, where a window ends at another row.
+waiting for them, from pinhole or lens to pinhole or lens. Only the first rows of the ground may differ, where a window ends at another row.
 
 V views have P = H W pixels each, K recorded frames each, and N with the others of their lenses. Points are tensors ``(V, 3, P)`` float64.
 """
@@ -15,6 +15,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from alpasim_plugin.cameras.image_map import DEGREE
+from alpasim_plugin.cameras.image_map_kernel import (
+    BENT,
+    LINEAR,
+    MAP_SIZE,
+    MIDDLE,
+    POLYNOMIAL,
+    S_MOST,
+)
 from alpasim_plugin.core.devices import upload, upload_together
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64
@@ -48,7 +57,9 @@ class UploadedImage:
         rgb: ``(3, H, W)`` float32 levels.
         depth: ``(H, W)`` metres.
         hidden: Depth, `HIDING_M` where a road user stands: it hides all ground behind it.
-        project: ``(3, 4)`` of the host, from the world to its pixels times depth.
+        project: ``(3, 4)`` of the host, from the world to its pixels times depth, through a lens to the
+            camera's axes.
+        visible: ``(H, W)`` 1 around where its lens sees something, else 0; None: it has none.
         others: See `RecordedImage`.
     """
 
@@ -57,6 +68,7 @@ class UploadedImage:
     depth: Tensor
     hidden: Tensor
     project: F64
+    visible: Tensor | None = None
     others: tuple[UploadedImage, ...] = ()
 
 
@@ -66,8 +78,13 @@ def upload_image(recorded: RecordedImage, device: torch.device) -> UploadedImage
     hidden = depth
     if recorded.users is not None:
         hidden = torch.where(upload(recorded.users, device), HIDING_M, depth)
-    project = recorded.K @ inverse(recorded.T_world_camera)[:3]
-    return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden, project)
+    project = inverse(recorded.T_world_camera)[:3]
+    visible = None
+    if recorded.lens is None:
+        project = recorded.K @ project
+    else:
+        visible = upload(recorded.lens.visible.astype(np.float32), device)
+    return UploadedImage(recorded, rgb.permute(2, 0, 1).float(), depth, hidden, project, visible)
 
 
 class CarriedView(NamedTuple):
@@ -100,19 +117,48 @@ class Shown(NamedTuple):
     rgb: Tensor  # (V N, 3, h, w) levels, see `_stacked`
     sizes_px: Tensor  # (V N, 2) height and width of each
     from_view: Tensor  # (V, 3 N, 4) from a view's pixels times depth to those of each frame
+    lenses: (
+        Tensor | None
+    )  # (V N, MAP_SIZE) `map_numbers` of each, 0 of pinholes; None: all are such
+    visible: Tensor | None  # (V N, h, w) see `UploadedImage`, 1 of pinholes
 
 
-def size_of(view: CarriedView) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
+class SharedSize(NamedTuple):
+    """What views share that are carried together.
+
+    Attributes:
+        shape: Height and width.
+        window_px: See `ground.window_px`.
+        lenses: Of each recorded frame how many show its lens, itself among them.
+        has_rays: Whether the views have a lens.
+        through_lens: Whether recorded frames have one.
+    """
+
+    shape: tuple[int, ...]
+    window_px: int
+    lenses: tuple[int, ...]
+    has_rays: bool
+    through_lens: bool
+
+
+def size_of(view: CarriedView) -> SharedSize:
     """Return what views share that are carried together."""
-    lenses = tuple(1 + len(image.others) for image in view.images)
-    return view.target.depth.shape, ground.window_px(view.target.K), lenses
+    return SharedSize(
+        view.target.depth.shape,
+        ground.window_px(view.target.K),
+        tuple(1 + len(image.others) for image in view.images),
+        view.target.rays is not None,
+        any(image.visible is not None for image in view.pinholes),
+    )
 
 
 def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     """Return the recorded frames in views of one `size_of`, ``(V, K, H, W, 4)`` uint8; see
     `ground.carry`. Several views are carried together while `WORKING_BYTES` hold them.
     """
-    (height, width), _, lenses = size_of(views[0])
+    shared = size_of(views[0])
+    height, width = shared.shape
+    lenses = shared.lenses
     together = max(1, WORKING_BYTES // (PIXEL_BYTES * height * width * sum(lenses)))
     starts = range(0, len(views), together)
     return torch.cat([_carry(views[i : i + together]) for i in starts])
@@ -120,26 +166,36 @@ def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
 
 def _carry(views: Sequence[CarriedView]) -> Tensor:
     depth = torch.stack([view.target.depth for view in views])  # type: ignore[misc]  # tensors here
-    (height, width), size, lenses = size_of(views[0])
-    rays = _rays(depth[0])
+    shared = size_of(views[0])
+    height, width = shared.shape
+    size = shared.window_px
+    lenses = shared.lenses
+    rays = _rays(views)
     flat = depth.flatten(1)
     images = [image for view in views for image in view.pinholes]
     lifted = np.array([_lifted(view) for view in views])
     project = np.array([image.project for image in images])
     T_world_rig = np.array([view.T_world_rig for view in views])
     sizes = np.array([image.depth.shape for image in images], dtype=np.float64)
-    from_view, planes, sizes_px, *boxes = upload_together(
+    from_view, planes, sizes_px, numbers, *boxes = upload_together(
         [
             project.reshape(len(views), -1, 4) @ lifted,
             (inverse(T_world_rig) @ lifted)[:, 2],
             sizes,
+            np.array([_lens_numbers(image) for image in images]),
             *_boxes(views),
         ],
         depth.device,
     )
     users = Users(*boxes)
     on_ground = _ground_depth(planes, rays, flat, users)
-    recorded = Shown(_stacked([image.rgb for image in images]), sizes_px, from_view)
+    recorded = Shown(
+        _stacked([image.rgb for image in images]),
+        sizes_px,
+        from_view,
+        numbers if shared.through_lens else None,
+        _visible(images) if shared.through_lens else None,
+    )
     surfaces, hidden = (
         _stacked([part[None] for part in parts])[:, 0]
         for parts in zip(*((image.depth, image.hidden) for image in images), strict=True)
@@ -181,8 +237,14 @@ def _filled(parts: Tensor, lenses: Sequence[int]) -> Tensor:
     return torch.stack(out, dim=1)
 
 
-def _rays(depth: Tensor) -> Tensor:
-    """Return the centres of the pixels of an image ``(3, P)``, (u, v, 1)."""
+def _rays(views: Sequence[CarriedView]) -> Tensor:
+    """Return what the pixels of views see: of pinholes their middles ``(3, P)``, (u, v, 1), of lenses
+    unit rays in the camera's axes ``(V, 3, P)``.
+    """
+    target = views[0].target
+    if target.rays is not None:
+        return torch.stack([view.target.rays_on_device.flatten(1) for view in views]).double()
+    depth: Tensor = target.depth  # type: ignore[assignment]  # a tensor here
     height, width = depth.shape
     rows = torch.arange(height, device=depth.device).double() + 0.5
     columns = torch.arange(width, device=depth.device).double() + 0.5
@@ -191,10 +253,24 @@ def _rays(depth: Tensor) -> Tensor:
 
 
 def _lifted(view: CarriedView) -> F64:
-    """Return the matrix ``(4, 4)`` from a view's pixels times depth to the world."""
+    """Return the matrix ``(4, 4)`` from what a view's pixels see, times depth, to the world."""
     T = view.target.T_world_camera.copy()
-    T[:3, :3] = T[:3, :3] @ np.linalg.inv(view.target.K)
+    if view.target.rays is None:
+        T[:3, :3] = T[:3, :3] @ np.linalg.inv(view.target.K)
     return T
+
+
+def _lens_numbers(image: UploadedImage) -> F64:
+    lens = image.recorded.lens
+    return np.zeros(MAP_SIZE) if lens is None else lens.numbers
+
+
+def _visible(images: Sequence[UploadedImage]) -> Tensor:
+    """Return where frames show anything ``(V N, h, w)``."""
+    masks = [
+        torch.ones_like(image.depth) if image.visible is None else image.visible for image in images
+    ]
+    return _stacked([mask[None] for mask in masks])[:, 0]
 
 
 def _boxes(views: Sequence[CarriedView]) -> tuple[F64, F64, F64, F64]:
@@ -247,14 +323,14 @@ def _warp(
         inside = (local >= users.walls[:, i, 0]) & (local < users.walls[:, i, 1])
         inside = inside.all(dim=1, keepdim=True) & (depth > 0)[:, None]
         in_recorded = torch.where(inside, _turned(users.then[:, i], local), in_recorded)
-    u, v, w = in_recorded.reshape(-1, 3, in_recorded.shape[2]).unbind(1)
-    u = u / w
-    v = v / w
+    u, v, w = _shown(recorded.lenses, in_recorded.reshape(-1, 3, in_recorded.shape[2]))
     height, width = recorded.sizes_px[..., None].unbind(1)
     inside_image = (w > NEAREST_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     u = torch.where(inside_image, u, 0.5)
     v = torch.where(inside_image, v, 0.5)
     place = v.long() * surfaces.shape[2] + u.long()
+    if recorded.visible is not None:
+        inside_image &= recorded.visible.flatten(1).gather(1, place) > 0
     surface = surfaces.flatten(1).gather(1, place).double()
     surface = torch.where(surface > 0, surface, INFINITY_M)
     far = (surface > INFINITY_M / 2) & (w > INFINITY_M / 2)
@@ -269,6 +345,57 @@ def _warp(
     levels = levels * inside_image[..., None]  # black where no frame shows anything, as on the host
     out = torch.cat([levels, held[..., None]], dim=-1).to(torch.uint8)
     return out.view(len(depth), -1, *out.shape[1:])
+
+
+def _shown(lenses: Tensor | None, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pixels u, v at which recorded cameras show points, and how far these are, ``(M, P)``
+    each.
+
+    Args:
+        lenses: See `Shown`.
+        points: ``(M, 3, P)`` pixels times depth, of lenses in the camera's axes.
+    """
+    x, y, z = points.unbind(1)
+    if lenses is None:
+        return x / z, y / z, z
+    u, v, distance = _lens_pixels(lenses, x, y, z)
+    has_lens = lenses[:, S_MOST, None] > 0
+    return (
+        torch.where(has_lens, u, x / z),
+        torch.where(has_lens, v, y / z),
+        torch.where(has_lens, distance, z),
+    )
+
+
+def _lens_pixels(lenses: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where lenses show points, and the distance of these; see `image_map_kernel.lens_pixel`."""
+    columns = lenses[..., None].unbind(1)
+    distance = (x * x + y * y + z * z).sqrt()
+    inverse_sum = 1 / torch.maximum(distance + z, 1e-9 * distance + 1e-30)
+    hx = x * inverse_sum
+    hy = y * inverse_sum
+    s = hx * hx + hy * hy
+    held = torch.minimum(s, columns[S_MOST])
+    shrink = (held / s.clamp(min=1e-30)).sqrt()
+    hx = hx * shrink
+    hy = hy * shrink
+    t = 2 * held / columns[S_MOST] - 1
+    g = columns[POLYNOMIAL + DEGREE] * torch.ones_like(t)
+    for k in range(DEGREE - 1, -1, -1):
+        g = g * t + columns[POLYNOMIAL + k]
+    p1, p2, s1, s2, s3, s4 = columns[BENT : BENT + 6]
+    tangent = 2 / (1 - held)
+    ax = hx * tangent
+    ay = hy * tangent
+    r2 = ax * ax + ay * ay
+    bent_x = 2 * p1 * ax * ay + p2 * (r2 + 2 * ax * ax) + r2 * (s1 + r2 * s2)
+    bent_y = p1 * (r2 + 2 * ay * ay) + 2 * p2 * ax * ay + r2 * (s3 + r2 * s4)
+    bends = (lenses[:, BENT : BENT + 6] != 0).any(dim=1, keepdim=True)
+    px = g * hx + torch.where(bends, bent_x, 0.0)
+    py = g * hy + torch.where(bends, bent_y, 0.0)
+    u = columns[LINEAR] * px + columns[LINEAR + 1] * py + columns[MIDDLE]
+    v = columns[LINEAR + 2] * px + columns[LINEAR + 3] * py + columns[MIDDLE + 1]
+    return u, v, distance
 
 
 def _stacked(images: Sequence[Tensor]) -> Tensor:
@@ -288,7 +415,7 @@ def _ground_depth(planes: Tensor, rays: Tensor, depth: Tensor, users: Users) -> 
     """Return the depth of the ground ``(V, P)`` where a pixel may show it, of planes ``(V, 4)``: how
     steeply a ray falls, and the height above the ground; see `ground.ground_hypothesis`.
     """
-    slope = planes[:, :3] @ rays
+    slope = (planes[:, None, :3] @ rays)[:, 0]
     z = -planes[:, 3:] / slope
     free = (slope < 0) & (z > ground.NEAREST_M) & (z < ground.FARTHEST_M)
     free &= (depth <= ground.FLOATING_M) | (depth >= FREE_SHARE * z)

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from alpasim_plugin.cameras.lens import Lens, blackened
+from alpasim_plugin.cameras.lens import blackened
 from alpasim_plugin.cameras.lens_cover import LensCover
-from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import FixerError, FixerFault, InputError
 from alpasim_plugin.core.interfaces import BlockRule, Fixer, Renderer
 from alpasim_plugin.core.lazy import installed
@@ -32,7 +31,6 @@ from alpasim_plugin.core.types import (
     Scenario,
     read_only,
 )
-from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.references import ReferenceSession, session_of
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import PreparedMap, prepare_map
@@ -93,44 +91,20 @@ class BlockRunner:
         return list(map(ConditionedFrame, requests, frames, maps))
 
     def _covered(self, requests: Sequence[RenderRequest]) -> list[ConditionedFrame]:
-        """Render the pinholes of each lens and join their frames. The map is drawn through the lens;
-        for a device, into the pinholes.
-        """
+        """Render the pinholes of each lens and join their frames; the map is drawn through the lens."""
         cuts = [self.cover.requests(request) for request in requests]
         pinholes = [part for cut in cuts for part in cut]
-        parts = self._with_references(pinholes, self.render_base(pinholes))
-        device = self._map_device(parts)
-        frames = self._joined(requests, cuts, parts, joined)
-        if implementation(device, True, False):
-            maps = self._maps(requests, "cpu")
-        else:
-            maps = self._joined(requests, cuts, self._maps(pinholes, device), _joined_map)
-        return list(map(ConditionedFrame, requests, frames, maps))
-
-    def _joined(
-        self,
-        requests: Sequence[RenderRequest],
-        cuts: Sequence[Sequence[RenderRequest]],
-        parts: Sequence[Any],
-        join: Callable[[str, Sequence[Lens], Sequence[Any]], Any],
-    ) -> list[Any]:
-        """Return what pinholes have, joined to that of the lens of each request."""
-        remaining = iter(parts)
+        parts = iter(self._with_references(pinholes, self.render_base(pinholes)))
         lens_parts = [
-            (request.camera.name, [next(remaining) for _ in cut])
+            (request.camera.name, [next(parts) for _ in cut])
             for request, cut in zip(requests, cuts, strict=True)
         ]
-        is_pending = isinstance(parts[0], Frame) and parts[0].pending is not None
-
-        def join_one(camera_parts: tuple[str, Sequence[Any]]) -> Any:
-            name, images = camera_parts
-            sides = self.cover.sides.get(name)
-            return images[0] if sides is None else join(name, sides, images)
-
         with self._timed("lens"):
-            return map_on_threads(
-                1 if is_pending else thread_count(self.threads), join_one, lens_parts
+            frames = map_on_threads(
+                thread_count(self.threads), lambda lens: self.cover.frame(*lens), lens_parts
             )
+        maps = self._maps(requests, self._map_device(frames))
+        return list(map(ConditionedFrame, requests, frames, maps))
 
     def _with_references(
         self, requests: Sequence[RenderRequest], frames: Sequence[Frame]
@@ -190,11 +164,6 @@ class BlockRunner:
         began = time.perf_counter()
         yield
         self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (time.perf_counter() - began)
-
-
-def _joined_map(camera: str, sides: Sequence[Lens], images: Sequence[Any]) -> Any:
-    """Return the map of a camera's lens from those of its pinholes, which a device drew."""
-    return None if images[0] is None else joined_image(sides, images)
 
 
 def _problem(rendered: Sequence[Frame], fixed: Sequence[Frame]) -> str:

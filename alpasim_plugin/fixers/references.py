@@ -46,6 +46,7 @@ from alpasim_plugin.fixers.settings import FixerSettings
 from alpasim_plugin.fixers.views import planes_of
 from alpasim_plugin.fixers.warp import RecordedImage, WarpTarget, recorded_lens
 from alpasim_plugin.gaussians.lens_camera import blind_part, lens_rays
+from alpasim_plugin.gaussians.raster.lens_on_device import rays_on_device
 from alpasim_plugin.gaussians.raster.stages import map_on_threads, thread_count
 
 # Decoded recorded frames that a session keeps, at least; of many cameras, those of so many instants.
@@ -239,8 +240,11 @@ class ReferenceSession:
         K_view = intrinsics_on_axis(request.camera)
         around = window_px(K_view)
         rays = None
+        rays_there = None
         if request.camera.lens is not None:
             rays = lens_rays(request.camera).ray.reshape(*depth.shape, 3)
+            if not isinstance(depth, np.ndarray):
+                rays_there = rays_on_device(request.camera, str(depth.device))[:3]
         windows = []
         for band in exposed_bands(request):
             top = max(band.rows.start - around, 0)
@@ -248,7 +252,11 @@ class ReferenceSession:
             K = K_view.copy()
             K[1, 2] -= top
             view = K, band.T_world_camera, depth[rows], band.actors, self._boxes
-            target = WarpTarget(*view, rays=None if rays is None else rays[rows])
+            target = WarpTarget(
+                *view,
+                rays=None if rays is None else rays[rows],
+                rays_on_device=None if rays_there is None else rays_there[:, rows],
+            )
             inner = slice(band.rows.start - top, band.rows.stop - top), band.columns
             windows.append(Window(band, target, inner))
         return windows
@@ -338,8 +346,16 @@ def _whole(
     ]
     exposed = [window.band for window in windows]
     images = [joined(request, exposed, parts) for parts in zip(*views, strict=True)]
-    blind = blind_part(request.camera)
-    return tuple(blackened(image, blind) for image in images)
+    return tuple(_seen(request.camera, image) for image in images)
+
+
+def _seen(camera: CameraSpec, image: Any) -> Any:
+    """Return an image of a camera that is black where its lens sees nothing."""
+    if camera.lens is None:
+        return image
+    if isinstance(image, np.ndarray):
+        return blackened(image, blind_part(camera))
+    return image * (rays_on_device(camera, str(image.device))[3:] > 0).permute(1, 2, 0)
 
 
 def session_of(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -59,6 +59,7 @@ class WarpTarget:
         ground: ``(H, W)`` which depths are the ground's; None: none is.
         rays: ``(H, W, 3)`` of unit length, in the camera's axes, what each pixel of a lens sees;
             None: the view is the pinhole ``K``.
+        rays_on_device: ``(3, H, W)`` the same beside a depth that is on a device.
     """
 
     K: F64
@@ -68,6 +69,7 @@ class WarpTarget:
     boxes: Mapping[str, Box]
     ground: Bool | None = None
     rays: F64 | None = None
+    rays_on_device: Any = None
 
     def window(self, rows: slice, columns: slice) -> WarpTarget:
         """Return a part of the view, all its pixels or, as the slices' step says, some."""

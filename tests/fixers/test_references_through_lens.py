@@ -146,6 +146,36 @@ def test_each_pixel_of_a_lens_shows_the_point_that_it_sees_where_that_was_record
         assert (held & behind).sum() > 50
 
 
+@pytest.mark.parametrize(("then", "now"), PAIRS)
+def test_a_card_carries_frames_from_lens_to_lens_as_the_cpu_does(then, now):
+    """Beside a frame of another camera, and with a road user that has moved."""
+    pytest.importorskip("torch")
+    import torch
+
+    from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, upload_image
+
+    boxes = {"car": Box(4.0, 2.0, 1.6)}
+    here = at(-0.8, 0.4, 0.0)
+    below = se2(0.0, 0.0, 0.0, -1.5)
+    frames = []
+    for name, there in ((then, at(1.0, -0.5, 0.5, 0.2)), ("pinhole", at(0.4, 0.2, -0.2))):
+        depth_then = ball_depth(SPECS[name], there)
+        rgb = painted(points_of(SPECS[name], there, depth_then))
+        actors = {"car": se2(4.0, 2.5, 0.2)}
+        frames.append(with_users(recorded(SPECS[name], there, rgb, depth_then, actors), boxes))
+    view = target(SPECS[now], here, ball_depth(SPECS[now], here), {"car": se2(3, 3, 0.3)}, boxes)
+    wanted = carry(frames, view, below)
+    rays = view.rays if view.rays is None else torch.tensor(view.rays.transpose(2, 0, 1))
+    there = replace(view, depth=torch.from_numpy(view.depth), rays_on_device=rays)
+    uploaded = [upload_image(frame, torch.device("cpu")) for frame in frames]
+    (images,) = carry_on_device([CarriedView(uploaded, there, below)])
+    for image, due in zip(images.numpy(), wanted, strict=True):
+        apart = np.abs(image.astype(int) - due).max(axis=-1)
+        assert (due[..., 3] > 0).mean() > 0.1
+        # A window at the first row of the ground ends at another row than the processor's.
+        assert (apart > 1).mean() < 0.01
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_a_frame_carried_into_the_lens_that_recorded_it_is_itself(name):
     spec, T = SPECS[name], at(3.0, 1.0, 0.3)

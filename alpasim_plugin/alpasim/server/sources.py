@@ -31,14 +31,12 @@ from alpasim_plugin.alpasim.server.map_gate import beside, contradiction
 from alpasim_plugin.alpasim.server.shutters import exposure_of, lens_exposure
 from alpasim_plugin.alpasim.server.status import CallTime, UpstreamFault
 from alpasim_plugin.alpasim.server.views import View, camera_of, read_sides, straight_of
-from alpasim_plugin.cameras.lens import Lens, blind_of, require_sight
+from alpasim_plugin.cameras.lens import Lens, blind_of, joined, require_sight
 from alpasim_plugin.cameras.shutter import at_share
-from alpasim_plugin.core.devices import implementation
 from alpasim_plugin.core.errors import InputError, SimrunError
 from alpasim_plugin.core.files.images import read_image
 from alpasim_plugin.core.geometry import interpolate, inverse, project
 from alpasim_plugin.core.types import F32, F64, U8, Bool, CameraSpec, Frame, RenderRequest
-from alpasim_plugin.fixers.lenses import joined, joined_image
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import actor_boxes
 from alpasim_plugin.gaussians.lens_camera import blind_part, lens_rays
@@ -184,26 +182,12 @@ def name_in_scene(entry: SceneEntry, view: View) -> str:
 
 
 def drawn_map(entry: SceneEntry, request: RenderRequest, device: Any = "cpu") -> Any:
-    """Return the semantic map as the request's lens, or for a device its pinhole, sees it; None where
-    the fixer takes none.
-    """
+    """Return the semantic map as the request's lens sees it; None where the fixer takes none."""
     if entry.scene_map is None:
         return None
     actors = entry.scenario.actors
     (image,) = draw_exposed_maps(entry.scene_map, [request], actors, device=device)
     return image
-
-
-def drawn_map_of_cover(
-    entry: SceneEntry, requests: Sequence[RenderRequest], sides: Sequence[Lens], device: Any
-) -> Any:
-    """Return the semantic map of a lens that a device draws in the pinholes that cover it; None where
-    the fixer takes none.
-    """
-    if entry.scene_map is None:
-        return None
-    actors = entry.scenario.actors
-    return joined_image(sides, draw_exposed_maps(entry.scene_map, requests, actors, device=device))
 
 
 def with_fitting_map(
@@ -344,11 +328,7 @@ class LocalSource:
         with left.holding(self._busy):
             frames = entry.render(requests, entry.reads_device)
             frame = joined(requests[0].camera.name, pinholes, frames)
-            device = frame.device if entry.reads_device else "cpu"
-            if implementation(device, True, False):
-                sdmap = drawn_map(entry, through_lens)
-            else:
-                sdmap = drawn_map_of_cover(entry, requests, pinholes, device)
+            sdmap = drawn_map(entry, through_lens)
         rendered = Rendered(frame.changed(camera=view.camera), sdmap, blind_of(pinholes))
         if sdmap is None:
             return rendered

@@ -18,7 +18,7 @@ import numpy as np
 
 from alpasim_plugin.cameras.lens import exposed_bands
 from alpasim_plugin.cameras.shutter import joined
-from alpasim_plugin.core.devices import batched, implementation
+from alpasim_plugin.core.devices import batched, implementation, upload
 from alpasim_plugin.core.geometry import inverse
 from alpasim_plugin.core.types import F64, U8, Actor, CameraSpec, RenderRequest
 from alpasim_plugin.fixers.semantic_map import kernels, lens_kernels
@@ -106,9 +106,9 @@ def draw_exposed_maps(
         actors: The scenario's, for the sizes of their boxes.
         threads: As many CPU threads; None leaves numba's number.
         device: What draws the maps; a card keeps them as tensors, and draws all of one size at
-            once.
+            once. Those through lenses are drawn on the CPU and sent there.
     """
-    draw = implementation(device, partial(_on_host, threads), partial(_on_card, device))
+    draw = implementation(device, partial(_on_host, threads), partial(_on_card, device, threads))
     cuts = [exposed_bands(request) for request in requests]
     views = [
         (request.camera, band.T_world_camera, actor_boxes(band.actors, actors), band.rows)
@@ -132,7 +132,19 @@ def _on_host(threads: int | None, scene: PreparedMap, views: Sequence[View]) -> 
     ]
 
 
-def _on_card(device: Any, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
+def _on_card(
+    device: Any, threads: int | None, scene: PreparedMap, views: Sequence[View]
+) -> list[Any]:
+    """Draw maps on a card; those through lenses are drawn on the CPU and sent there."""
+    return batched(
+        views, lambda view: view[0].lens is not None, partial(_sent, device, threads, scene)
+    )
+
+
+def _sent(device: Any, threads: int | None, scene: PreparedMap, views: Sequence[View]) -> list[Any]:
+    """Return the maps of views, which all have a lens or none, on a card."""
+    if views[0][0].lens is not None:
+        return [upload(image, device) for image in _on_host(threads, scene, views)]
     from alpasim_plugin.fixers.semantic_map.on_device import draw_tiles, size_of
 
     visible = [(*seen_from(scene, camera, T, actors), rows) for camera, T, actors, rows in views]
