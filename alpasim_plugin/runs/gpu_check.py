@@ -21,10 +21,11 @@ import numpy as np
 import torch
 
 from alpasim_plugin.cameras.lens import resized
+from alpasim_plugin.cameras.shutter import rolling
 from alpasim_plugin.core.devices import download, facts_of, require_device, upload
 from alpasim_plugin.core.printing import say
 from alpasim_plugin.core.seeding import stream
-from alpasim_plugin.core.types import F32, Frame, RenderRequest, Scenario
+from alpasim_plugin.core.types import F32, Exposure, Frame, LensModel, RenderRequest, Scenario
 from alpasim_plugin.fixers import make_fixer
 from alpasim_plugin.fixers.semantic_map.draw import draw_exposed_maps
 from alpasim_plugin.fixers.semantic_map.prepare import prepare_map
@@ -50,6 +51,7 @@ MIDDLE = (960, 544)
 LARGE = (1920, 1080)
 SIZES = ((256, 144), MIDDLE, (1920, 1088))
 SPLATS = 5_000  # of the image whose gradients are compared
+MOVED_M = 0.3  # while a shutter is open: 10 m/s for 30 ms
 REPEATS = 5
 # Grey levels, or thousandths of the largest gradient, by which a card may differ from the CPU.
 LEVELS = 2
@@ -103,6 +105,20 @@ def rasteriser(device: str) -> Facts:
 
     def renders(width: int, height: int, name: str) -> Call:
         request = frame_request(scenario, width, height)
+        return lambda: renderers[name].render(request).rgb
+
+    return compared(device, renders)
+
+
+def lens(device: str) -> Facts:
+    """Compare frames of a built street through a fisheye of 190 degrees with a rolling shutter with
+    those of the CPU, and time them.
+    """
+    scenario = load_scenario(SCENE)
+    renderers = {name: make_renderer("clean", scenario, 0, name) for name in (device, "cpu")}
+
+    def renders(width: int, height: int, name: str) -> Call:
+        request = lens_request(scenario, width, height)
         return lambda: renderers[name].render(request).rgb
 
     return compared(device, renders)
@@ -191,6 +207,7 @@ def fixer_rate(device: str) -> Facts:
 SECTIONS: dict[str, Callable[[str], Facts]] = {
     "card": card,
     "rasteriser": rasteriser,
+    "lens": lens,
     "semantic_map": semantic_map,
     "fixer": fixer,
     "block_fixer": block_fixer,
@@ -202,6 +219,7 @@ SECTIONS: dict[str, Callable[[str], Facts]] = {
 # What leaves out the part of a section that failed; where nothing does, the card is left out.
 ON_CPU = "run with --device cpu"
 AVOIDED_BY = {
+    "lens": f"give the scenario pinhole cameras, without a lens or shutter_us; otherwise {ON_CPU}",
     "semantic_map": f"--set fixer.uses_map=false fixes without a map; otherwise {ON_CPU}",
     "fixer": f"--renderer 3dgs leaves the fixer out; otherwise {ON_CPU}",
     "block_fixer": f"--renderer onefixer fixes frame by frame; otherwise {ON_CPU}",
@@ -279,6 +297,22 @@ def frame_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
     t_us = int(scenario.ego_log.t_us[0]) + 1_000_000
     request = recorded_requests(scenario, t_us)[0]
     return replace(request, camera=resized(request.camera, width, height))
+
+
+def lens_request(scenario: Scenario, width: int, height: int) -> RenderRequest:
+    """Return the same frame through a fisheye of 190 degrees, whose rows are exposed while the camera
+    moves by `MOVED_M`.
+    """
+    request = frame_request(scenario, width, height)
+    most_rad = np.deg2rad(95.0)
+    focal_px = width / (2 * most_rad)
+    K = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
+    camera = replace(request.camera, K=K, lens=LensModel("fisheye", max_angle_rad=most_rad))
+    end = request.T_world_camera[1]
+    start = end.copy()
+    start[:3, 3] -= MOVED_M * end[:3, 2]
+    exposure = Exposure(rolling(width, height, "rows", backwards=False), dict(request.actors))
+    return replace(request, camera=camera, T_world_camera=np.stack([start, end]), exposure=exposure)
 
 
 def _gradients(
