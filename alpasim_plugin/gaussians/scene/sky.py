@@ -215,9 +215,9 @@ def _places_on_device(numbers: Tensor, pixels: Tensor, rays: Tensor, px_per_rad:
     import torch
 
     time = (numbers[:, None, 11:14] @ pixels).clamp(-0.5, 0.5)
-    seen = numbers[:, :9].view(-1, 3, 3) @ rays
-    seen = seen + time * (numbers[:, 14:].view(-1, 3, 3) @ rays)
-    x, y, z = seen.unbind(1)
+    ahead = numbers[:, :9].view(-1, 3, 3) @ rays
+    ahead = ahead + time * (numbers[:, 14:].view(-1, 3, 3) @ rays)
+    x, y, z = ahead.unbind(1)
     angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
     return torch.addcmul(numbers[:, None, 9:11], angles, px_per_rad).float().mT
 
