@@ -173,7 +173,7 @@ def test_kernels_compile_without_spilling(capability):
         check=True,
     )
     lines = done.stdout.splitlines()
-    names = "project list_tiles composite composite_backward draw_tiles"
+    names = "project list_tiles composite composite_backward project_lens composite_lens draw_tiles"
     assert [line.split()[0] for line in lines] == names.split()
     assert all("stack 0 " in line for line in lines), lines
 

@@ -26,18 +26,30 @@ from alpasim_plugin.gaussians.raster import (
     lens_small_kernels,
     lens_touch_kernels,
 )
-from alpasim_plugin.gaussians.raster.triton_kernels import (
-    _ALPHA_MIN,
-    _EPS2D_PX2,
-    colour,
+from alpasim_plugin.gaussians.raster.triton_functions import (
+    ALPHA_MIN,
+    EPS2D_PX2,
+    added,
+    as_f32,
+    as_f64,
+    combined,
+    cross,
+    dot,
     ellipse_q2,
+    factor_rows,
     layer,
+    number,
+    offsets,
     pixels_of,
-    tiles_between,
+    scaled,
+    store_colours,
+    store_pixels,
+    store_tiles,
+    vector,
+    vector32,
 )
 
 _POSE = tl.constexpr(lens_on_device.LENS_POSE)
-_CENTRE = tl.constexpr(constants.POSE_CENTRE)
 _ANTIALIAS = tl.constexpr(constants.POSE_ANTIALIAS)
 _NEAR = tl.constexpr(constants.POSE_NEAR)
 _FAR = tl.constexpr(constants.POSE_FAR)
@@ -96,67 +108,7 @@ _BEYOND = tl.constexpr(lens_small_kernels.BEYOND)
 _MOST_CHANGE = tl.constexpr(lens_small_kernels.MOST_CHANGE)
 _EIGHTH = tl.constexpr(0.5**0.5)  # cosine and sine of an eighth of a turn
 _TINY = tl.constexpr(1e-30)
-
-
-# Three tensors, one per axis, are a tuple.
-
-
-@triton.jit
-def _row(numbers, place):
-    """Return three float64 numbers."""
-    return tl.load(numbers + place), tl.load(numbers + place + 1), tl.load(numbers + place + 2)
-
-
-@triton.jit
-def _number(numbers, place):
-    """Return a number in float32."""
-    return tl.load(numbers + place).to(tl.float32)
-
-
-@triton.jit
-def _row32(numbers, place):
-    return _number(numbers, place), _number(numbers, place + 1), _number(numbers, place + 2)
-
-
-@triton.jit
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@triton.jit
-def _scaled(a, k):
-    return a[0] * k, a[1] * k, a[2] * k
-
-
-@triton.jit
-def _added(a, b):
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-@triton.jit
-def _chosen(mask, a, b):
-    return tl.where(mask, a[0], b[0]), tl.where(mask, a[1], b[1]), tl.where(mask, a[2], b[2])
-
-
-@triton.jit
-def _as_f64(a):
-    return a[0].to(tl.float64), a[1].to(tl.float64), a[2].to(tl.float64)
-
-
-@triton.jit
-def _as_f32(a):
-    return a[0].to(tl.float32), a[1].to(tl.float32), a[2].to(tl.float32)
-
-
-@triton.jit
-def _combined(weights, a, b, c):
-    """Return the sum of three vectors with weights."""
-    return _added(_added(_scaled(a, weights[0]), _scaled(b, weights[1])), _scaled(c, weights[2]))
+_ROUNDING = tl.constexpr(1e-5)  # of a distance, in float32
 
 
 # Where a lens shows points: see `lens_map_kernels`.
@@ -164,22 +116,22 @@ def _combined(weights, a, b, c):
 
 @triton.jit
 def _polynomial(lens, FIRST: tl.constexpr, DEGREE: tl.constexpr, s):
-    x = s * (2.0 / _number(lens, _S_MOST)) - 1.0
-    value = x * _number(lens, FIRST + DEGREE) + _number(lens, FIRST + DEGREE - 1)
+    x = s * (2.0 / number(lens, _S_MOST)) - 1.0
+    value = x * number(lens, FIRST + DEGREE) + number(lens, FIRST + DEGREE - 1)
     for k in tl.static_range(2, DEGREE + 1):
-        value = value * x + _number(lens, FIRST + DEGREE - k)
+        value = value * x + number(lens, FIRST + DEGREE - k)
     return value
 
 
 @triton.jit
 def _place_on_sphere(lens, p):
     """Return h of points, held to where the lens is described, its s and that before."""
-    n = tl.sqrt(_dot(p, p))
+    n = tl.sqrt(dot(p, p))
     inverse = 1.0 / tl.maximum(n + p[2], 1e-6 * n + 1e-30)
     hx = p[0] * inverse
     hy = p[1] * inverse
     s = hx * hx + hy * hy
-    held = tl.minimum(s, _number(lens, _S_MOST))
+    held = tl.minimum(s, number(lens, _S_MOST))
     shrink = tl.sqrt(held / tl.maximum(s, 1e-30))
     return hx * shrink, hy * shrink, held, s
 
@@ -193,14 +145,14 @@ def _pixel(lens, hx, hy, held, g, BENDS: tl.constexpr):
         tx = hx * k
         ty = hy * k
         r2 = tx * tx + ty * ty
-        p1 = _number(lens, _BENT)
-        p2 = _number(lens, _BENT + 1)
-        x += r2 * (_number(lens, _BENT + 2) + r2 * _number(lens, _BENT + 3))
+        p1 = number(lens, _BENT)
+        p2 = number(lens, _BENT + 1)
+        x += r2 * (number(lens, _BENT + 2) + r2 * number(lens, _BENT + 3))
         x += 2.0 * p1 * tx * ty + p2 * (2.0 * tx * tx + r2)
-        y += r2 * (_number(lens, _BENT + 4) + r2 * _number(lens, _BENT + 5))
+        y += r2 * (number(lens, _BENT + 4) + r2 * number(lens, _BENT + 5))
         y += p1 * (2.0 * ty * ty + r2) + 2.0 * p2 * tx * ty
-    u = x * _number(lens, _LINEAR) + y * _number(lens, _LINEAR + 1) + _number(lens, _MIDDLE)
-    v = x * _number(lens, _LINEAR + 2) + y * _number(lens, _LINEAR + 3) + _number(lens, _MIDDLE + 1)
+    u = x * number(lens, _LINEAR) + y * number(lens, _LINEAR + 1) + number(lens, _MIDDLE)
+    v = x * number(lens, _LINEAR + 2) + y * number(lens, _LINEAR + 3) + number(lens, _MIDDLE + 1)
     return u, v
 
 
@@ -215,14 +167,14 @@ def _shown(lens, p, BENDS: tl.constexpr):
 @triton.jit
 def _times_bent(lens, hx, hy, held, j0, j1, j2, j3):
     """Return a Jacobian by h with that of the tangential and thin prism terms added."""
-    p1 = _number(lens, _BENT)
-    p2 = _number(lens, _BENT + 1)
+    p1 = number(lens, _BENT)
+    p2 = number(lens, _BENT + 1)
     t = 2.0 / (1.0 - held)
     x = hx * t
     y = hy * t
     r2 = x * x + y * y
-    fx = r2 * 4.0 * _number(lens, _BENT + 3) + 2.0 * _number(lens, _BENT + 2)
-    fy = r2 * 4.0 * _number(lens, _BENT + 5) + 2.0 * _number(lens, _BENT + 4)
+    fx = r2 * 4.0 * number(lens, _BENT + 3) + 2.0 * number(lens, _BENT + 2)
+    fy = r2 * 4.0 * number(lens, _BENT + 5) + 2.0 * number(lens, _BENT + 4)
     xx = 2.0 * p1 * y + 6.0 * p2 * x + fx * x
     xy = 2.0 * p1 * x + 2.0 * p2 * y + fx * y
     yx = 2.0 * p1 * x + 2.0 * p2 * y + fy * x
@@ -249,10 +201,10 @@ def _slopes(lens, hx, hy, held, g, BENDS: tl.constexpr):
     j3 = slope * hy * hy + g
     if BENDS:
         j0, j1, j2, j3 = _times_bent(lens, hx, hy, held, j0, j1, j2, j3)
-    a0 = _number(lens, _LINEAR)
-    a1 = _number(lens, _LINEAR + 1)
-    a2 = _number(lens, _LINEAR + 2)
-    a3 = _number(lens, _LINEAR + 3)
+    a0 = number(lens, _LINEAR)
+    a1 = number(lens, _LINEAR + 1)
+    a2 = number(lens, _LINEAR + 2)
+    a3 = number(lens, _LINEAR + 3)
     k = 0.5 * held + 0.5
     return (
         k * (a0 * j0 + a1 * j2),
@@ -279,9 +231,9 @@ def _tangents(p, n):
 @triton.jit
 def _turned(a, turn, time):
     """Return vectors turned by ``time turn``, to second order."""
-    first = _cross(turn, a)
-    second = _cross(turn, first)
-    return _added(_added(a, _scaled(first, time)), _scaled(second, 0.5 * time * time))
+    first = cross(turn, a)
+    second = cross(turn, first)
+    return added(added(a, scaled(first, time)), scaled(second, 0.5 * time * time))
 
 
 @triton.jit
@@ -291,20 +243,20 @@ def _moved_at(p, pose, motion, lens, time):
     """
     node = tl.load(pose + _NODE_MOTION).to(tl.int32)
     motion += tl.maximum(node, 0) * _MOTION
-    node_turn = _scaled(_row32(motion, _MOTION_TURN), (node >= 0).to(tl.float32))
-    moved = _row32(pose, _MOVED)
-    from_centre = _added(p, _scaled(_row32(motion, _MOTION_CENTRE), -1.0))
-    even = _added(_cross(node_turn, from_centre), _scaled(moved, -1.0))
-    place = _added(p, _scaled(even, time))
-    turn = _row32(lens, _LENS_TURN)
-    speed = _added(even, _scaled(_cross(turn, place), -1.0))
+    node_turn = scaled(vector32(motion, _MOTION_TURN), (node >= 0).to(tl.float32))
+    moved = vector32(pose, _MOVED)
+    from_centre = added(p, scaled(vector32(motion, _MOTION_CENTRE), -1.0))
+    even = added(cross(node_turn, from_centre), scaled(moved, -1.0))
+    place = added(p, scaled(even, time))
+    turn = vector32(lens, _LENS_TURN)
+    speed = added(even, scaled(cross(turn, place), -1.0))
     return _turned(place, turn, -time), _turned(speed, turn, -time)
 
 
 @triton.jit
 def _time_of(lens, u, v, most):
     """Return when pixels are exposed, in shutters from the middle, held to ``most``."""
-    time = u * _number(lens, _TIME) + v * _number(lens, _TIME + 1) + _number(lens, _TIME + 2)
+    time = u * number(lens, _TIME) + v * number(lens, _TIME + 1) + number(lens, _TIME + 2)
     return tl.minimum(tl.maximum(time, -most), most)
 
 
@@ -336,22 +288,25 @@ def _time_seen(p, pose, motion, lens, most, BENDS: tl.constexpr):
 @triton.jit
 def _in_node(pose, a):
     """Return a row in the camera's axes times the rotation from a node to the camera."""
-    return _combined(a, _row32(pose, 0), _row32(pose, 3), _row32(pose, 6))
+    return combined(a, vector32(pose, 0), vector32(pose, 3), vector32(pose, 6))
 
 
 @triton.jit
-def _is_small(lens, pose, factor, p, low_pass, turn_rad, shift_m):
-    """Return which Gaussians an ellipse of the image shows closely enough."""
-    inverse = 1.0 / tl.sqrt(_dot(p, p))
-    along = _combined(_in_node(pose, _scaled(p, inverse)), factor[0], factor[1], factor[2])
-    along2 = _dot(along, along)
-    whole2 = _dot(factor[0], factor[0]) + _dot(factor[1], factor[1]) + _dot(factor[2], factor[2])
+def _is_small(lens, pose, factor, p, n):
+    """Return which Gaussians, at distances ``n``, an ellipse of the image shows closely enough."""
+    turn_rad = number(pose, _MOVES_RAD)
+    shift_m = number(pose, _MOVES_M)
+    inverse = 1.0 / n
+    along = combined(_in_node(pose, scaled(p, inverse)), factor[0], factor[1], factor[2])
+    along2 = dot(along, along)
+    whole2 = dot(factor[0], factor[0]) + dot(factor[1], factor[1]) + dot(factor[2], factor[2])
     across = tl.sqrt(tl.maximum(whole2 - along2, 0.0)) * inverse
-    shutters = tl.abs(_number(lens, _TIME)) + tl.abs(_number(lens, _TIME + 1))
-    shutters *= _number(lens, _MOST)
-    bend = inverse * shutters * shift_m + _number(lens, _BEND) + shutters * turn_rad
-    off = (across + low_pass) * bend + tl.sqrt(along2) * inverse
-    return (off <= _number(lens, _SMALL)) & (across <= _WIDEST)
+    shutters = tl.abs(number(lens, _TIME)) + tl.abs(number(lens, _TIME + 1))
+    shutters *= number(lens, _MOST)
+    bend = inverse * shutters * shift_m + number(lens, _BEND) + shutters * turn_rad
+    off = (across + _low_pass(lens, pose)) * bend + tl.sqrt(along2) * inverse
+    is_close = (off <= number(lens, _SMALL)) & (across <= _WIDEST)
+    return is_close & (n >= _SMALL_SHIFTS * shift_m)
 
 
 @triton.jit
@@ -359,11 +314,11 @@ def _image_rows(place, k0, k1, k2, k3):
     """Return by how much the pixel changes with places, two rows in the camera's axes, and the
     distance.
     """
-    n = tl.sqrt(_dot(place, place))
+    n = tl.sqrt(dot(place, place))
     right, down = _tangents(place, n)
     inverse = 1.0 / n
-    to_u = _added(_scaled(right, k0 * inverse), _scaled(down, k1 * inverse))
-    to_v = _added(_scaled(right, k2 * inverse), _scaled(down, k3 * inverse))
+    to_u = added(scaled(right, k0 * inverse), scaled(down, k1 * inverse))
+    to_v = added(scaled(right, k2 * inverse), scaled(down, k3 * inverse))
     return to_u, to_v, n
 
 
@@ -372,22 +327,22 @@ def _in_image(row_u, row_v, factor, eps):
     """Return covariances in the image at an instant, their determinants over the last number, and the
     share of that without the low-pass in it.
     """
-    m = _combined(row_u, factor[0], factor[1], factor[2])
-    n = _combined(row_v, factor[0], factor[1], factor[2])
-    nn = _dot(n, n)
-    c11 = _dot(m, m) + eps
+    m = combined(row_u, factor[0], factor[1], factor[2])
+    n = combined(row_v, factor[0], factor[1], factor[2])
+    nn = dot(n, n)
+    c11 = dot(m, m) + eps
     c22 = nn + eps
-    minors = _scaled(_cross(m, n), tl.sqrt(1.0 / c22))
-    raw = _dot(minors, minors)
+    minors = scaled(cross(m, n), tl.sqrt(1.0 / c22))
+    raw = dot(minors, minors)
     variance = raw + eps * ((c11 + nn) / c22)
-    return c11, _dot(m, n), c22, variance, raw / variance
+    return c11, dot(m, n), c22, variance, raw / variance
 
 
 @triton.jit
 def _while_exposed(lens, move_u, move_v, c11, c12, c22, variance):
     """Return `_in_image` of a rolling shutter, without the share."""
-    time_u = _number(lens, _TIME)
-    time_v = _number(lens, _TIME + 1)
+    time_u = number(lens, _TIME)
+    time_v = number(lens, _TIME + 1)
     inverse = 1.0 / (1.0 - move_u * time_u - move_v * time_v)
     g00 = move_u * time_u * inverse + 1.0
     g01 = move_u * time_v * inverse
@@ -426,19 +381,19 @@ def _write_small(
     g = _polynomial(lens, _G, _DEGREE, held)
     u, v = _pixel(lens, hx, hy, held, g, BENDS)
     k0, k1, k2, k3 = _slopes(lens, hx, hy, held, g, BENDS)
-    mask = mask & (s < _number(lens, _S_MOST))
+    mask = mask & (s < number(lens, _S_MOST))
     row_u, row_v, n = _image_rows(place, k0, k1, k2, k3)
     if ROLLS:
-        move_u = _dot(row_u, speed)
-        move_v = _dot(row_v, speed)
-        change = tl.abs(move_u * _number(lens, _TIME)) + tl.abs(move_v * _number(lens, _TIME + 1))
+        move_u = dot(row_u, speed)
+        move_v = dot(row_v, speed)
+        change = tl.abs(move_u * number(lens, _TIME)) + tl.abs(move_v * number(lens, _TIME + 1))
         mask = mask & (change <= _MOST_CHANGE)
-        turn = _row32(pose, _TURN)
+        turn = vector32(pose, _TURN)
         # A row times a rotation is the row turned back.
         row_u = _turned(row_u, turn, -time)
         row_v = _turned(row_v, turn, -time)
-    antialias = _number(pose, _ANTIALIAS)
-    eps = tl.where(antialias > 0, antialias, _EPS2D_PX2)
+    antialias = number(pose, _ANTIALIAS)
+    eps = tl.where(antialias > 0, antialias, EPS2D_PX2)
     node_u = _in_node(pose, row_u)
     node_v = _in_node(pose, row_v)
     c11, c12, c22, variance, kept = _in_image(node_u, node_v, factor, eps)
@@ -453,8 +408,8 @@ def _write_small(
     tl.store(record + _INVERSE_O2, n * 0.0 - 1.0, mask)
     tl.store(record + _OPACITY, opacity * tl.where(antialias > 0, tl.sqrt(kept), 1.0), mask)
     tl.store(record + _DISTANCE_SEEN, n, mask)
-    half_u = extent * tl.sqrt(c11) + _number(lens, _MARGIN)
-    half_v = extent * tl.sqrt(c22) + _number(lens, _MARGIN)
+    half_u = extent * tl.sqrt(c11) + number(lens, _MARGIN)
+    half_v = extent * tl.sqrt(c22) + number(lens, _MARGIN)
     return mask, u - half_u, u + half_u, v - half_v, v + half_v
 
 
@@ -464,13 +419,13 @@ def _write_small(
 @triton.jit
 def _covariance(pose, factor):
     """Return the six numbers of covariances in the camera's axes, float64."""
-    f0 = _as_f64(factor[0])
-    f1 = _as_f64(factor[1])
-    f2 = _as_f64(factor[2])
-    x = _combined(_row(pose, 0), f0, f1, f2)
-    y = _combined(_row(pose, 3), f0, f1, f2)
-    z = _combined(_row(pose, 6), f0, f1, f2)
-    return _dot(x, x), _dot(x, y), _dot(x, z), _dot(y, y), _dot(y, z), _dot(z, z)
+    f0 = as_f64(factor[0])
+    f1 = as_f64(factor[1])
+    f2 = as_f64(factor[2])
+    x = combined(vector(pose, 0), f0, f1, f2)
+    y = combined(vector(pose, 3), f0, f1, f2)
+    z = combined(vector(pose, 6), f0, f1, f2)
+    return dot(x, x), dot(x, y), dot(x, z), dot(y, y), dot(y, z), dot(z, z)
 
 
 @triton.jit
@@ -503,9 +458,9 @@ def _kept_share(s, right, down, k0, k1, k2, k3, eps, n2):
     """
     sr = _times(s, right)
     sd = _times(s, down)
-    rr = _dot(sr, right)
-    rd = _dot(sr, down)
-    dd = _dot(sd, down)
+    rr = dot(sr, right)
+    rd = dot(sr, down)
+    dd = dot(sd, down)
     inverse = 1.0 / n2
     uu = inverse * (k0 * k0 * rr + 2.0 * k0 * k1 * rd + k1 * k1 * dd)
     vv = inverse * (k2 * k2 * rr + 2.0 * k2 * k3 * rd + k3 * k3 * dd)
@@ -522,10 +477,10 @@ def _low_passed(s, p, n2, right, down, k0, k1, k2, k3, eps):
     m01 = -k1 * scale
     m10 = -k2 * scale
     m11 = k0 * scale
-    s = _with_square(s, _as_f64(_added(_scaled(right, m00), _scaled(down, m10))))
-    s = _with_square(s, _as_f64(_added(_scaled(right, m01), _scaled(down, m11))))
+    s = _with_square(s, as_f64(added(scaled(right, m00), scaled(down, m10))))
+    s = _with_square(s, as_f64(added(scaled(right, m01), scaled(down, m11))))
     size = tl.sqrt(0.5 * (m00 * m00 + m01 * m01 + m10 * m10 + m11 * m11) / n2)
-    return _with_square(s, _as_f64(_scaled(p, size)))
+    return _with_square(s, as_f64(scaled(p, size)))
 
 
 @triton.jit
@@ -555,7 +510,7 @@ def _row_solved(lower, inverses, q, k):
     """Return ``k q L^-1``."""
     z = q[2] * inverses[2]
     y = (q[1] - lower[4] * z) * inverses[1]
-    return _scaled(((q[0] - lower[1] * y - lower[3] * z) * inverses[0], y, z), k)
+    return scaled(((q[0] - lower[1] * y - lower[3] * z) * inverses[0], y, z), k)
 
 
 @triton.jit
@@ -593,8 +548,8 @@ def _box(
     bend_u = u * 0.0
     bend_v = u * 0.0
     for _ in range(4):
-        u1, v1, s1 = _shown(lens, _added(place, first), BENDS)
-        u2, v2, s2 = _shown(lens, _added(place, _scaled(first, -1.0)), BENDS)
+        u1, v1, s1 = _shown(lens, added(place, first), BENDS)
+        u2, v2, s2 = _shown(lens, added(place, scaled(first, -1.0)), BENDS)
         left = tl.minimum(left, tl.minimum(u1, u2))
         right = tl.maximum(right, tl.maximum(u1, u2))
         top = tl.minimum(top, tl.minimum(v1, v2))
@@ -602,16 +557,16 @@ def _box(
         bend_u = tl.maximum(bend_u, tl.abs(0.5 * (u1 + u2) - u))
         bend_v = tl.maximum(bend_v, tl.abs(0.5 * (v1 + v2) - v))
         s = tl.maximum(s, tl.maximum(s1, s2))
-        turned_first = _scaled(_added(first, second), _EIGHTH)
-        second = _scaled(_added(second, _scaled(first, -1.0)), _EIGHTH)
+        turned_first = scaled(added(first, second), _EIGHTH)
+        second = scaled(added(second, scaled(first, -1.0)), _EIGHTH)
         first = turned_first
-    more_u = bend_u + _number(lens, _MARGIN)
-    more_v = bend_v + _number(lens, _MARGIN)
-    everywhere = s >= _number(lens, _S_MOST)
+    more_u = bend_u + number(lens, _MARGIN)
+    more_v = bend_v + number(lens, _MARGIN)
+    everywhere = s >= number(lens, _S_MOST)
     if ROLLS:
-        rate = tl.abs(_number(lens, _TIME)) * (right - left)
-        rate += tl.abs(_number(lens, _TIME + 1)) * (bottom - top)
-        late = rate * (shift_m / n + turn_rad) * (_LATE * _number(lens, _MOST)) + 0.1
+        rate = tl.abs(number(lens, _TIME)) * (right - left)
+        rate += tl.abs(number(lens, _TIME + 1)) * (bottom - top)
+        late = rate * (shift_m / n + turn_rad) * (_LATE * number(lens, _MOST)) + 0.1
         more_u += late
         more_v += late
         everywhere = everywhere | (n < _NEAR_SHIFTS * shift_m)
@@ -641,27 +596,27 @@ def _write_large(
     BENDS: tl.constexpr,
 ):
     """Write the rows of Gaussians at ``p``, float64; return their boxes."""
-    place = _as_f32(p)
+    place = as_f32(p)
     if ROLLS:
         time = _time_seen(place, pose, motion, lens, 0.5, BENDS)
         place, _ = _moved_at(place, pose, motion, lens, time)
-    at_n2 = _dot(place, place)
+    at_n2 = dot(place, place)
     at_n = tl.sqrt(at_n2)
     hx, hy, held, _ = _place_on_sphere(lens, place)
     k0, k1, k2, k3 = _slopes(lens, hx, hy, held, _polynomial(lens, _G, _DEGREE, held), BENDS)
     right, down = _tangents(place, at_n)
-    antialias = _number(pose, _ANTIALIAS)
-    eps = tl.where(antialias > 0, antialias, _EPS2D_PX2)
+    antialias = number(pose, _ANTIALIAS)
+    eps = tl.where(antialias > 0, antialias, EPS2D_PX2)
     s = _covariance(pose, factor)
-    kept = _kept_share(s, _as_f64(right), _as_f64(down), k0, k1, k2, k3, eps, at_n2.to(tl.float64))
+    kept = _kept_share(s, as_f64(right), as_f64(down), k0, k1, k2, k3, eps, at_n2.to(tl.float64))
     tl.store(record + _OPACITY, opacity * tl.where(antialias > 0, tl.sqrt(kept), 1.0), mask)
     tl.store(record + _DISTANCE_SEEN, at_n, mask)
     s = _low_passed(s, place, at_n2, right, down, k0, k1, k2, k3, eps)
     lower, inverses = _cholesky(s)
     w = _solved(lower, inverses, p)
-    o2 = _dot(w, w)
+    o2 = dot(w, w)
     o = tl.sqrt(o2)
-    w = _scaled(w, 1.0 / o)
+    w = scaled(w, 1.0 / o)
     q1, q2 = _basis(w)
     _store3(record, _A, _row_solved(lower, inverses, q1, n), mask)
     _store3(record, _B, _row_solved(lower, inverses, q2, n), mask)
@@ -669,24 +624,24 @@ def _write_large(
     tl.store(record + _INVERSE_O2, (1.0 / o2).to(tl.float32), mask)
     ratio = extent * extent / o2
     out = _AROUND * extent / tl.sqrt(tl.maximum(1.0 - ratio, 1.0 - _CLOSE))
-    first = _as_f32(_scaled(_spread(lower, q1), out))
-    second = _as_f32(_scaled(_spread(lower, q2), out))
+    first = as_f32(scaled(_spread(lower, q1), out))
+    second = as_f32(scaled(_spread(lower, q2), out))
     n32 = n.to(tl.float32)
-    turn_rad = _number(pose, _MOVES_RAD)
-    shift_m = _number(pose, _MOVES_M)
+    turn_rad = number(pose, _MOVES_RAD)
+    shift_m = number(pose, _MOVES_M)
     left, right_end, top, bottom, everywhere = _box(
         lens, place, n32, first, second, turn_rad, shift_m, ROLLS, BENDS
     )
-    size2 = tl.maximum(_dot(first, first), _dot(second, second))
+    size2 = tl.maximum(dot(first, first), dot(second, second))
     everywhere = everywhere | (ratio >= _CLOSE) | (size2 > _WIDE * n32 * n32)
     if ROLLS:
-        moved = _solved(lower, inverses, _row(pose, _MOVED))
-        _store3(record, _ROW_S, (_dot(moved, q1), _dot(moved, q2), _dot(moved, w) / o), mask)
-        passing = _solved(lower, inverses, _row(pose, _SHIFT))
-        nearer = o - 0.55 * tl.sqrt(_dot(passing, passing))
+        moved = _solved(lower, inverses, vector(pose, _MOVED))
+        _store3(record, _ROW_S, (dot(moved, q1), dot(moved, q2), dot(moved, w) / o), mask)
+        passing = _solved(lower, inverses, vector(pose, _SHIFT))
+        nearer = o - 0.55 * tl.sqrt(dot(passing, passing))
         passed = nearer < tl.maximum(2.0 * extent, 0.5 * o)
         everywhere = everywhere | passed
-        tl.store(record + _NODE, n32 * 0.0 + _number(pose, _NODE_MOTION), mask)
+        tl.store(record + _NODE, n32 * 0.0 + number(pose, _NODE_MOTION), mask)
         tl.store(record + _DISTANCE, n32, mask)
         tl.store(record + _PASSED, passed.to(tl.float32), mask)
     left = tl.where(everywhere, -_EVERY, left)
@@ -697,23 +652,26 @@ def _write_large(
 
 
 @triton.jit
-def _offset(means, i, present, pose):
-    """Return Gaussians' means from the camera's centre in their node's axes, float64."""
-    centre = _row(pose, _CENTRE)
-    return (
-        tl.load(means + 3 * i, present, 0.0) - centre[0],
-        tl.load(means + 3 * i + 1, present, 0.0) - centre[1],
-        tl.load(means + 3 * i + 2, present, 0.0) - centre[2],
-    )
+def _low_pass(lens, pose):
+    """Return the standard deviation of a pixel's low-pass, radians, the largest in the image."""
+    return tl.sqrt(tl.maximum(number(pose, _ANTIALIAS), EPS2D_PX2)) / number(lens, _LEAST)
 
 
 @triton.jit
-def _factor_row(factors, i, visible):
-    return (
-        tl.load(factors + 9 * i, visible, 0.0),
-        tl.load(factors + 9 * i + 1, visible, 0.0),
-        tl.load(factors + 9 * i + 2, visible, 0.0),
+def _reach(lens, pose, factor, n, extent):
+    """Return how far Gaussians at distances ``n`` are drawn from their means, metres."""
+    size = tl.sqrt(
+        dot(factor[0], factor[0]) + dot(factor[1], factor[1]) + dot(factor[2], factor[2])
     )
+    moved = 0.5 * (n * number(pose, _MOVES_RAD) + number(pose, _MOVES_M))
+    return extent * (1.5 * _low_pass(lens, pose) * n + size) + moved + _ROUNDING * n
+
+
+@triton.jit
+def _in_cone(lens, p, reach):
+    """Return which points may lie no farther than ``reach`` outside the cone that the image shows."""
+    across = tl.sqrt(p[0] * p[0] + p[1] * p[1])
+    return across * number(lens, _COS) - p[2] * number(lens, _SIN) <= reach
 
 
 @triton.jit
@@ -755,37 +713,23 @@ def project_lens(
     i = (tl.load(spans + block * 4 + 1) + lane).to(tl.int64)
     view = tl.load(spans + block * 4 + 3)
     lens = lenses + view * _LENS_SIZE
-    d = _offset(means, i, present, pose)
-    p = _dot(_row(pose, 0), d), _dot(_row(pose, 3), d), _dot(_row(pose, 6), d)
-    n = tl.sqrt(_dot(p, p))
+    d = offsets(means, i, present, pose)
+    p = dot(vector(pose, 0), d), dot(vector(pose, 3), d), dot(vector(pose, 6), d)
+    n = tl.sqrt(dot(p, p))
     opacity = tl.load(opacities + i, present, 0.0)
     extent = tl.load(extents + i, present, 0.0)
-    visible = present & (opacity >= _ALPHA_MIN)
+    visible = present & (opacity >= ALPHA_MIN)
     visible = visible & (n >= tl.load(pose + _NEAR)) & (n <= tl.load(pose + _FAR))
-    p = _chosen(visible, p, (n * 0.0, n * 0.0, n * 0.0 + 1.0))
+    # What is not visible is computed as if it stood straight ahead.
+    p = tl.where(visible, p[0], 0.0), tl.where(visible, p[1], 0.0), tl.where(visible, p[2], 1.0)
     n = tl.where(visible, n, 1.0)
-    factor = (
-        _factor_row(factors, i, visible),
-        _factor_row(factors + 3, i, visible),
-        _factor_row(factors + 6, i, visible),
-    )
-    turn_rad = _number(pose, _MOVES_RAD)
-    shift_m = _number(pose, _MOVES_M)
-    low_pass = tl.sqrt(tl.maximum(_number(pose, _ANTIALIAS), _EPS2D_PX2)) / _number(lens, _LEAST)
-    p32 = _as_f32(p)
+    factor = factor_rows(factors, i, visible)
+    p32 = as_f32(p)
     n32 = n.to(tl.float32)
-    size = tl.sqrt(
-        _dot(factor[0], factor[0]) + _dot(factor[1], factor[1]) + _dot(factor[2], factor[2])
-    )
-    reach = extent * (1.5 * low_pass * n32 + size) + 0.5 * (n32 * turn_rad + shift_m)
-    across = tl.sqrt(p32[0] * p32[0] + p32[1] * p32[1])
-    visible = visible & (
-        across * _number(lens, _COS) - p32[2] * _number(lens, _SIN) <= reach + 1e-5 * n32
-    )
+    visible = visible & _in_cone(lens, p32, _reach(lens, pose, factor, n32, extent))
     slot = block * BLOCK + lane
     record = records + slot.to(tl.int64) * LENGTH
-    small = visible & (n32 >= _SMALL_SHIFTS * shift_m)
-    small = small & _is_small(lens, pose, factor, p32, low_pass, turn_rad, shift_m)
+    small = visible & _is_small(lens, pose, factor, p32, n32)
     left = n32 * 0.0
     right = left
     top = left
@@ -803,42 +747,35 @@ def project_lens(
         right = tl.where(large, far_right, right)
         top = tl.where(large, far_top, top)
         bottom = tl.where(large, far_bottom, bottom)
-    x0, x1 = tiles_between(left, right, tiles_x, TILE)
-    y0, y1 = tiles_between(top, bottom, tiles_y, TILE)
-    count = tl.maximum(x1 - x0, 0) * tl.maximum(y1 - y0, 0)
-    count = tl.where(visible, count, 0)
     largest = tl.maximum(tl.maximum(tl.abs(p[0]), tl.abs(p[1])), tl.abs(p[2]))
-    tl.store(depths + slot, tl.where(visible, largest.to(tl.float32), float("inf")))
-    tl.store(counts + slot, count)
-    above = view * tiles_y
-    tl.store(boxes + slot * 4, x0)
-    tl.store(boxes + slot * 4 + 1, x1)
-    tl.store(boxes + slot * 4 + 2, above + y0)
-    tl.store(boxes + slot * 4 + 3, above + y1)
-    on_screen = count > 0
-    length = tl.sqrt(_dot(d, d))
-    inverse = 1.0 / tl.where(visible, length, 1.0)
-    toward = _as_f32(_scaled(d, inverse))
-    first = i * (SIZE * 3)
-    for channel in tl.static_range(3):
-        value = colour(sh_ptr, first, on_screen, toward[0], toward[1], toward[2], channel, SIZE)
-        tl.store(record + _RED + channel, value, on_screen)
+    on_screen = store_tiles(
+        left,
+        right,
+        top,
+        bottom,
+        visible,
+        depths,
+        boxes,
+        counts,
+        slot,
+        largest.to(tl.float32),
+        view * tiles_y,
+        tiles_x,
+        tiles_y,
+        TILE,
+    )
+    store_colours(sh_ptr, i, d, record, on_screen, SIZE)
 
 
 # Compositing: see `lens_raster_kernels`.
 
 
 @triton.jit
-def _record_row(record, column):
-    return tl.load(record + column), tl.load(record + column + 1), tl.load(record + column + 2)
-
-
-@triton.jit
 def _still_q2(record, inverse_o2, d):
     """Return q^2 on rays from the camera's centre."""
-    a = _dot(_record_row(record, _A), d)
-    b = _dot(_record_row(record, _B), d)
-    ahead = tl.maximum(_dot(_record_row(record, _C), d), 0.0)
+    a = dot(vector(record, _A), d)
+    b = dot(vector(record, _B), d)
+    ahead = tl.maximum(dot(vector(record, _C), d), 0.0)
     across = tl.maximum(a * a + b * b, _TINY)
     return across / (ahead * ahead + across * inverse_o2)
 
@@ -846,30 +783,30 @@ def _still_q2(record, inverse_o2, d):
 @triton.jit
 def _rolling_q2(record, inverse_o2, d, time, lens, motion):
     """Return q^2 on the rays of a rolling shutter."""
-    row_a = _record_row(record, _A)
-    row_b = _record_row(record, _B)
-    row_c = _record_row(record, _C)
-    s = _scaled(_record_row(record, _ROW_S), time)
+    row_a = vector(record, _A)
+    row_b = vector(record, _B)
+    row_c = vector(record, _C)
+    s = scaled(vector(record, _ROW_S), time)
     node = tl.load(record + _NODE)
     if node >= 0:
         # The ray that meets a moving road user at the shutter's middle as this ray does at its time.
         motion += node.to(tl.int32) * _MOTION
-        turn = _row32(motion, _MOTION_TURN)
-        speed = _row32(motion, _MOTION_SPEED)
-        centre = _row32(motion, _MOTION_CENTRE)
-        start = _scaled(_added(_row32(lens, _LENS_SHIFT), _scaled(speed, -1.0)), time)
-        start = _turned(_added(start, _scaled(centre, -1.0)), turn, -time)
-        start = _added(start, centre)
+        turn = vector32(motion, _MOTION_TURN)
+        speed = vector32(motion, _MOTION_SPEED)
+        centre = vector32(motion, _MOTION_CENTRE)
+        start = scaled(added(vector32(lens, _LENS_SHIFT), scaled(speed, -1.0)), time)
+        start = _turned(added(start, scaled(centre, -1.0)), turn, -time)
+        start = added(start, centre)
         d = _turned(d, turn, -time)
         inverse_n = 1.0 / tl.load(record + _DISTANCE)
         s = (
-            _dot(row_a, start) * inverse_n,
-            _dot(row_b, start) * inverse_n,
-            _dot(row_c, start) * inverse_n,
+            dot(row_a, start) * inverse_n,
+            dot(row_b, start) * inverse_n,
+            dot(row_c, start) * inverse_n,
         )
-    a = _dot(row_a, d)
-    b = _dot(row_b, d)
-    c = _dot(row_c, d)
+    a = dot(row_a, d)
+    b = dot(row_b, d)
+    c = dot(row_c, d)
     x = s[1] * c + (b - s[2] * b)
     y = s[0] * c + (a - s[2] * a)
     z = s[0] * b - s[1] * a
@@ -929,7 +866,7 @@ def composite_lens(
     time = px * 0.0
     if ROLLS:
         time = _time_of(lens, px, py, 0.5)
-        d = _turned(d, _row32(lens, _LENS_TURN), time)
+        d = _turned(d, vector32(lens, _LENS_TURN), time)
     transmittance = open_.to(tl.float32)
     red = tl.zeros((TILE, TILE), tl.float32)
     green = tl.zeros((TILE, TILE), tl.float32)
@@ -946,11 +883,10 @@ def composite_lens(
             inverse_o2 = tl.load(record + _INVERSE_O2)
             if inverse_o2 < 0:
                 q2 = ellipse_q2(record, px, py)
+            elif ROLLS:
+                q2 = _rolling_q2(record, inverse_o2, d, time, lens, motion)
             else:
-                if ROLLS:
-                    q2 = _rolling_q2(record, inverse_o2, d, time, lens, motion)
-                else:
-                    q2 = _still_q2(record, inverse_o2, d)
+                q2 = _still_q2(record, inverse_o2, d)
             alpha = tl.load(record + _OPACITY) * tl.exp(-0.5 * q2)
             visible, weight, transmittance, open_ = layer(alpha, transmittance, open_)
             red += weight * tl.load(record + _RED)
@@ -961,10 +897,4 @@ def composite_lens(
         begin = stop
         if tl.max(open_.to(tl.int32)) == 0:
             begin = end
-    out = image + pixel * 6
-    tl.store(out, red, inside)
-    tl.store(out + 1, green, inside)
-    tl.store(out + 2, blue, inside)
-    tl.store(out + 3, depth, inside)
-    tl.store(out + 4, transmittance, inside)
-    tl.store(out + 5, last.to(tl.float32), inside)
+    store_pixels(image + pixel * 6, (red, green, blue), depth, transmittance, last, inside)
