@@ -5,6 +5,7 @@ run. The full numbers, which stand beside the properties (`tests.examples`), are
 ``SIMRUN_HYPOTHESIS=nightly pytest -n auto --dist loadfile``, others in every run.
 """
 
+import gc
 import os
 import shutil
 import sys
@@ -45,6 +46,18 @@ def pytest_configure(config):
         folder = tempfile.mkdtemp(prefix="simrun-tests-")
         os.environ["SIMRUN_CACHE"] = folder
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection(session):
+    """Collect without Python's own search for cycles: modules and tests are made by the million and
+    stay until the end, so nothing that it finds is worth a second's walk over them, then or later.
+    """
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
+    session.config.add_cleanup(gc.unfreeze)
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -97,16 +97,17 @@ def test_every_pixel_of_a_lens_is_exposed_at_the_time_of_its_row_or_column(spec,
 
 
 @pytest.mark.parametrize(
-    ("asked", "rolls"),
+    ("shutter", "rolls"),
     [
-        (ask(DOWN), True),
-        (ask(UP), True),
-        (ask(sensorsim_pb2.GLOBAL), False),
-        (ask(sensorsim_pb2.UNKNOWN), False),
-        (ask(DOWN, ms=0), False),
+        ({"shutter_type": DOWN}, True),
+        ({"shutter_type": UP}, True),
+        ({"shutter_type": sensorsim_pb2.GLOBAL}, False),
+        ({"shutter_type": sensorsim_pb2.UNKNOWN}, False),
+        ({"shutter_type": DOWN, "ms": 0}, False),
     ],
 )
-def test_what_rolls(asked, rolls):
+def test_what_rolls(shutter, rolls):
+    asked = ask(**shutter)
     found = exposure(asked)
     assert (found is not None) == rolls
     if found is not None:

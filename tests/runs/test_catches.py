@@ -3,6 +3,7 @@ it for, where the recorded drive and the same policy without the fault have none
 """
 
 import functools
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,7 @@ from evaluators import rollout_values, score
 from evaluators.metrics.outcomes import OUTCOMES
 from policies.lane_camera import LaneCamera
 from policies.simple import LogReplay, PurePursuit
-from scenarios.load import catches_of, scene_id_of
+from scenarios.load import catches_of
 from scenarios.schema import FAULTS
 from scenarios.suite import load_suite, suites
 from tests.runs.faulty_policies import (
@@ -41,9 +42,14 @@ def entries():
     """Return every scene of every suite once, as the suite sets it, by a name for people."""
     refs = {(ref.path, ref.overrides): ref for name in suites() for ref in load_suite(name)}
     return {
-        scene_id_of(ref) + (" as suites/first sets it" if ref.overrides else ""): ref
+        name_of(ref) + (" as suites/first sets it" if ref.overrides else ""): ref
         for ref in refs.values()
     }
+
+
+def name_of(ref):
+    """Return a scene's folder and file, without reading it: names are wanted for every collection."""
+    return "-".join(Path(ref.path).with_suffix("").parts[-2:])
 
 
 def outcomes(scenario, policy):
