@@ -13,6 +13,10 @@ SIMRUN = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?simrun\s+(.*)$")
 OTHER = re.compile(r"^(?:\$ )?(?:\.venv/bin/)?(?:python3?(?:\.\d+)?|pip|pytest)\s")
 STEP = re.compile(r"^\s*- run: (.*)$", re.M)
 TUTORIALS = ("docs/good-renderer.md", "docs/first-gate.md", "docs/recorded-street.md")
+# Pages whose commands are run one after another, and where.
+WALKED = dict.fromkeys(TUTORIALS, "test_commands.py") | {
+    "docs/first-policy.md": "test_first_policy.py"
+}
 NO_COMMAND = (
     r"──",  # a picture of the order of commands
 )
@@ -45,12 +49,14 @@ NOT_RUN = (  # the first rule that fits counts
         "a record of several runs; tests/cli/test_gate_and_compare.py runs each case",
     ),
 )
-SHORT = ("--set", "timing.duration_us=1200000", "--workers", "2")
+# In one process: workers are started by the pages that are walked, as often as their commands do.
+SHORT = ("--set", "timing.duration_us=1200000", "--workers", "1")
 LONGER = (
     "--set",
     "timing.duration_us=3000000",
     *SHORT[2:],
 )  # for AlpaSim's time line, which drives by the log for 1.7 s
+TINY = ("--set", "cameras=[{width: 96, height: 54}]")
 NOTHING_FITTED = (
     "--set",
     "degradation.kind=none",
@@ -75,8 +81,8 @@ class Command:
     @property
     def why_not_run(self):
         """Say why it is only parsed; empty if it is run."""
-        if self.page in TUTORIALS:
-            return "walked as a whole: test_commands.py"
+        if self.page in WALKED:
+            return f"walked as a whole: {WALKED[self.page]}"
         line = " ".join(self.words)
         return next((why for pattern, why in NOT_RUN if re.search(pattern, line)), "")
 
