@@ -17,6 +17,11 @@ from alpasim_plugin.cli.main import run_command
 from alpasim_plugin.log.run_folder.schema import ROLLOUTS_FOLDER
 from tests.core.hostile_commands import DRIVE, simrun
 
+SHORT_DRIVE = [
+    *DRIVE,
+    *("--out", "new", "--seeds", "1", "--set", "timing.duration_us=1200000", "smoke/straight"),
+]
+
 
 class Bait:
     """What leaves its name in a file when it is run, in the languages that the ways need."""
@@ -104,7 +109,7 @@ def git_hooks(folder, bait):
         (folder / name).write_bytes(hook.read_bytes())
         (folder / name).chmod(0o755)
     (folder / ".gitattributes").write_text("* filter=x\n")
-    return [[*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
+    return [SHORT_DRIVE]
 
 
 def yaml_tags(folder, bait):
@@ -207,7 +212,7 @@ def programs(folder, bait):
     for name in ("git", "ffmpeg", "nvidia-smi", "sinfo", "sysctl", "ps", "python", "python3", "sh"):
         (folder / name).write_text(f"#!/bin/sh\n{bait.shell}\n")
         (folder / name).chmod(0o755)
-    return [["doctor"], [*DRIVE, "--out", "new", "--seeds", "1", "smoke/straight"]]
+    return [["doctor"], SHORT_DRIVE]
 
 
 WAYS = {
