@@ -16,7 +16,8 @@ from alpasim_plugin.runs.vary import BoundarySearch, Sweep, has_failed
 from evaluators.statistics.boundary import PARTS
 from scenarios.suite import ScenarioRef
 
-DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1", "--images", "none"]
+DRIVE = ["--renderer", "clean", "--policy", "pure-pursuit", "--workers", "1"]
+DRIVE += ["--images", "none", "--video", "none"]
 PLAIN = ["--set", "environment.buildings=0"]
 GAP = ["--vary", "actors.cutter.s_m=10..30"]
 
