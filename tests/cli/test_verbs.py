@@ -72,13 +72,27 @@ def test_a_command_looks_for_cycles_seldom():
 
 def test_a_run_is_planned_and_reported_without_plots_networks_or_kernels():
     """Its workers load what drives; while they are started, nothing else is to load here."""
-    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'scipy.spatial', 'scipy.stats', 'torch', 'av'} & sys.modules.keys())"
+    code = "import sys, alpasim_plugin.cli.run; print({'matplotlib', 'numba', 'pandas', 'scipy.spatial', 'scipy.stats', 'torch', 'av'} & sys.modules.keys())"
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True
         ).stdout.strip()
         == "set()"
     )
+
+
+@pytest.mark.slow
+def test_a_drive_loads_no_library_of_scipy_of_which_it_would_use_one_function(tmp_path):
+    libraries = "{'scipy.interpolate', 'scipy.optimize', 'scipy.spatial', 'scipy.stats'}"
+    code = f"import sys; from alpasim_plugin.cli.main import run_command; print(run_command(sys.argv[1:])); print({libraries} & sys.modules.keys())"
+    words = ["--renderer", "clean", "--policy", "lane-camera", "--workers", "1", "smoke/curve"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words, "--out", str(tmp_path / "run")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines()[-2:] == ["0", "set()"]
 
 
 def test_the_name_of_a_class_is_no_emoji(capsys):

@@ -16,7 +16,6 @@ from urllib.parse import quote
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.dataset as pads
 
 from alpasim_plugin.core.files import (
     inside,
@@ -51,9 +50,7 @@ from alpasim_plugin.log.run_folder.writer import rollout_table
 
 TRACEBACK_LINES = 3
 STEP_COLUMNS = (*KEYS, "t_us", "metric", "value", "valid", LOG_COLUMN.name)
-TEXT_AS_CODES = pads.ParquetFileFormat(
-    dictionary_columns={"renderer", "policy", "scene", "metric", LOG_COLUMN.name}
-)
+TEXT_AS_CODES = {"renderer", "policy", "scene", "metric", LOG_COLUMN.name}
 
 REMADE: dict[Path, TemporaryDirectory[str]] = {}  # run folder -> tables that were made again
 
@@ -240,8 +237,11 @@ class Run:
         if path not in self._steps_checked:
             STEPS_TABLE.check(path)
             self._steps_checked.add(path)
+        import pyarrow.dataset as pads  # with it comes pandas, where that is installed
+
+        codes = TEXT_AS_CODES if coded else set[str]()
         with parsing(path, AGAIN, "no readable parquet"):
-            rows = pads.dataset(path, format=TEXT_AS_CODES if coded else "parquet")
+            rows = pads.dataset(path, format=pads.ParquetFileFormat(dictionary_columns=codes))
             of_logs = LOG_COLUMN.name in rows.schema.names
             names = [name for name in columns if of_logs or name != LOG_COLUMN.name]
             return rows.to_table(columns=names, filter=keep)

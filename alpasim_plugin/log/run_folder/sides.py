@@ -8,17 +8,19 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as pads
 import pyarrow.parquet as pq
 
 from alpasim_plugin.core.files import parsing
 from alpasim_plugin.core.types import F64, I64, Bool
 from alpasim_plugin.log.run_folder.records import Manifest
 from alpasim_plugin.log.run_folder.schema import KEYS, ROLLOUTS_TABLE, VALID, is_named, metrics_in
+
+if TYPE_CHECKING:
+    import pyarrow.dataset as pads
 
 AGAIN = "Write the tables of this run again with its own command."
 
@@ -239,7 +241,7 @@ class RolloutTable:
         location: str,
         reasons: Callable[[str, str], str] = lambda renderer, metric: "",
     ) -> None:
-        self._data = pads.dataset(data) if isinstance(data, pa.Table) else data
+        self._data = data
         self._location = location
         self.reasons = reasons
         self._columns: dict[str, F64] = {}
@@ -269,6 +271,8 @@ class RolloutTable:
         Raises:
             InputError: A file is no such table.
         """
+        import pyarrow.dataset as pads  # with it comes pandas, where that is installed
+
         for path in paths:
             ROLLOUTS_TABLE.check(path, AGAIN)
         location = ", ".join(map(str, paths))
@@ -328,6 +332,8 @@ class RolloutTable:
 
     def _read(self, names: Sequence[str]) -> pa.Table:
         with parsing(self._location, AGAIN, "no readable parquet"):
+            if isinstance(self._data, pa.Table):
+                return self._data.select(list(names))
             return self._data.to_table(columns=list(names))
 
     def _side(self, renderer: str, policy: str, rows: I64) -> Side:
