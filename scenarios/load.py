@@ -387,7 +387,7 @@ def _hash(draft: SceneDraft, scene_id: str, source_hash: str) -> str:
         del content["map"]
     else:
         content["map"][spec.map.source[0]] = "given by its content"
-        _drop(content["map"], ("lanelet2",))
+        _drop(content["map"], ("lanelet2", "cyclists"))
     if spec.background is not None:
         content["background"]["file"] = "given by its content"
     scene = hashlib.sha256(json.dumps([scene_id, source_hash, content], sort_keys=True).encode())

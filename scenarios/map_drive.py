@@ -27,9 +27,10 @@ from scenarios.countries import centre_line, first_from_right
 from scenarios.ego_path import grid
 from scenarios.expert import Follower, drive
 from scenarios.junction_rules import turning_lines
+from scenarios.map_cyclists import place_cyclists
 from scenarios.map_lines import bordered, gaps_m, ground_of, link_notes
 from scenarios.map_route import NARROWEST_M, STATION_M, WIDEST_M, LaneGraph, Spot, Way
-from scenarios.map_traffic import place_followers, stopping_m
+from scenarios.map_traffic import Rides, place_followers, stopping_m
 from scenarios.map_walkers import place_walkers
 from scenarios.recorded import RecordedLog, SourceFiles
 from scenarios.schema_parts import MapRoute, MapSpec
@@ -112,7 +113,7 @@ def map_drive(draft: SceneDraft, vehicle: Vehicle) -> RecordedLog:
         (),
         street.origin,
         files.content_hash,
-        (*_notes(way, goal_m, heads, len(followers)), *gap_notes, *street.notes),
+        (*_notes(way, goal_m, heads, followers, spec.map.cyclists), *gap_notes, *street.notes),
         route=Route(line.xyz[::4], way.lane_ids),
         path_beyond=_up_to_goal(driven, driven.length_m - front_m - 1.0, ego_log.xyz),
         path_end="goal",
@@ -176,7 +177,7 @@ def _traffic(
     front_m: float,
     limits: _TimeLimits,
 ) -> tuple[Sequence[Follower], Sequence[Actor]]:
-    """Return the drivers and the walkers around the route, at places that the seed draws.
+    """Return the drivers, with cyclists, and the walkers around the route, at places that the seed draws.
 
     Args:
         draft: Scene and seed.
@@ -188,13 +189,15 @@ def _traffic(
         front_m: From the rear axle to the front of the ego.
         limits: How long the scene lasts at most.
     """
+    rides = Rides(lane_map, way, line)
     followers = place_followers(
-        lane_map,
-        way,
-        line,
+        rides,
         spec.vehicles,
         stream(draft.scene_id, draft.spec.seed, "scenario/map/vehicles"),
         spec.lane_changes,
+    )
+    cyclists = place_cyclists(
+        rides, spec.cyclists, stream(draft.scene_id, draft.spec.seed, "scenario/map/cyclists")
     )
     walkers = place_walkers(
         lane_map,
@@ -205,7 +208,7 @@ def _traffic(
         grid(limits.of_scene_us(limits.expert_us)),
         stream(draft.scene_id, draft.spec.seed, "scenario/map/pedestrians"),
     )
-    return followers, walkers
+    return [*followers, *cyclists], walkers
 
 
 def _without_gaps(street: StreetMap) -> tuple[StreetMap, tuple[str, ...]]:
@@ -416,10 +419,19 @@ def _timed(
     return with_cycles(heads, begins_us)
 
 
-def _notes(way: Way, goal_m: float, heads: Sequence[Head], vehicles: int) -> tuple[str, ...]:
+def _notes(
+    way: Way,
+    goal_m: float,
+    heads: Sequence[Head],
+    followers: Sequence[Follower],
+    wanted_cyclists: int,
+) -> tuple[str, ...]:
     """Return what was chosen."""
+    cyclists = sum(follower.label == "cyclist" for follower in followers)
+    placed = f"{len(followers) - cyclists} vehicles"
+    placed += f" and {cyclists} of {wanted_cyclists} cyclists" if wanted_cyclists else ""
     notes = [
-        f"route of {goal_m:.0f} m from lane {way.lane_ids[0]}, with {vehicles} vehicles; the map "
+        f"route of {goal_m:.0f} m from lane {way.lane_ids[0]}, with {placed}; the map "
         f"within {AROUND_M:.0f} m of it is used"
     ]
     if heads:

@@ -39,13 +39,22 @@ class Way:
 
 
 class LaneGraph:
-    """Lanes for cars and how they follow one another; a lane that opens or closes, narrow at one
+    """Lanes of one kind and how they follow one another; a lane that opens or closes, narrow at one
     end, is not among them, nor is one whose edges do not run side by side.
+
+    Args:
+        lanes: The map's lanes.
+        kind: Of the lanes.
+        narrowest_m: No lane is narrower anywhere.
     """
 
-    def __init__(self, lanes: Mapping[str, Lane]) -> None:
+    def __init__(
+        self, lanes: Mapping[str, Lane], kind: str = "vehicle", narrowest_m: float = NARROWEST_M
+    ) -> None:
         self.lanes = {
-            key: lane for key, lane in lanes.items() if lane.kind == "vehicle" and _is_even(lane)
+            key: lane
+            for key, lane in lanes.items()
+            if lane.kind == kind and _is_even(lane, narrowest_m)
         }
         self.length_m = {
             lane_id: float(arc_lengths(lane.centre)[-1]) for lane_id, lane in self.lanes.items()
@@ -225,9 +234,9 @@ def _joined(way: Way, further: Way) -> Way:
     return Way((*way.lane_ids, *further.lane_ids[1:]), way.start_m, further.beyond_m)
 
 
-def _is_even(lane: Lane) -> bool:
-    """Return whether a car fits on a lane everywhere; its edges have the same stations."""
+def _is_even(lane: Lane, narrowest_m: float) -> bool:
+    """Return whether a lane is wide enough everywhere; its edges have the same stations."""
     assert lane.left is not None
     assert lane.right is not None
     widths_m = np.linalg.norm((lane.left - lane.right)[:, :2], axis=1)
-    return bool(widths_m.min() >= NARROWEST_M and widths_m.max() <= WIDEST_M)
+    return bool(widths_m.min() >= narrowest_m and widths_m.max() <= WIDEST_M)

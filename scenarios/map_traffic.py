@@ -6,12 +6,13 @@ a line to give way on one of them. Without a rule the vehicle is not placed; tho
 one another share their way.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from alpasim_plugin.core.types import I64, LaneMap
+from alpasim_plugin.core.types import I64, Lane, LaneMap
 from alpasim_plugin.world.ground import STACKED_M
 from alpasim_plugin.world.idm import allowed_speeds
 from alpasim_plugin.world.path import Path
@@ -39,7 +40,7 @@ TRIES = 8  # for each vehicle
 
 
 @dataclass(frozen=True)
-class _Ride:
+class Ride:
     """A vehicle's way, and the lines at which it waits."""
 
     way: Way
@@ -48,44 +49,65 @@ class _Ride:
     give_way: tuple[LightAhead, ...]
 
 
-def place_followers(
-    lane_map: LaneMap,
-    way: Way,
-    line: Path,
-    count: int,
-    rng: np.random.Generator,
-    lane_changes: bool = False,
-) -> list[Follower]:
-    """Return up to ``count`` vehicles on the lanes near a route, as many as find room.
+class Rides:
+    """Who drives around a route: the ego's ride and those of everybody who is placed.
 
     Args:
         lane_map: Map around the route.
         way: The ego's way.
         line: Its line.
+    """
+
+    def __init__(self, lane_map: LaneMap, way: Way, line: Path) -> None:
+        self.graph = LaneGraph(lane_map.lanes)
+        self._map = lane_map
+        self._rides = [self.ride(way, line)]
+
+    @property
+    def lanes(self) -> Mapping[str, Lane]:
+        """Give all lanes of the map, whatever drives on them."""
+        return self._map.lanes
+
+    def ride(self, way: Way, path: Path) -> Ride:
+        """Return the ride along a path."""
+        lanes = self._map.lanes
+        lights = lights_on(path, self._map.signals, lanes)
+        return Ride(way, path, lights, lights_on(path, self._map.give_way, lanes))
+
+    def admits(self, ride: Ride) -> bool:
+        """Return whether a ride begins apart from all others and it is clear who goes first."""
+        return not any(
+            _too_close(ride, other) or not _is_ruled(ride, other) for other in self._rides
+        )
+
+    def add(self, ride: Ride) -> None:
+        """Add somebody who is placed."""
+        self._rides.append(ride)
+
+
+def place_followers(
+    rides: Rides, count: int, rng: np.random.Generator, lane_changes: bool = False
+) -> list[Follower]:
+    """Return up to ``count`` vehicles on the lanes near a route, as many as find room.
+
+    Args:
+        rides: Who is placed already; the vehicles are added.
         count: Wanted vehicles.
         rng: Where and how fast they start.
         lane_changes: Whether they change lanes where that is worth it.
     """
-    graph = LaneGraph(lane_map.lanes)
-
-    def ride_on(of_way: Way, path: Path) -> _Ride:
-        lights = lights_on(path, lane_map.signals, lane_map.lanes)
-        give_way = lights_on(path, lane_map.give_way, lane_map.lanes)
-        return _Ride(of_way, path, lights, give_way)
-
+    graph = rides.graph
     followers: list[Follower] = []
-    rides = [ride_on(way, line)]
     for _ in range(TRIES * count):
         if len(followers) == count:
             break
         spot = graph.drawn_spot(rng)
         wanted_mps = float(rng.uniform(*SPEED_MPS))
-        start = Way((spot.lane_id,), spot.at_m, graph.length_m[spot.lane_id] - spot.at_m)
-        own_way = graph.carried_on(start, WAY_M)
+        own_way = graph.carried_on(graph.standing(spot), WAY_M)
         if own_way.beyond_m < SHORTEST_WAY_M:
             continue
-        candidate = ride_on(own_way, graph.line(own_way))
-        if any(_too_close(candidate, other) or not _is_ruled(candidate, other) for other in rides):
+        candidate = rides.ride(own_way, graph.line(own_way))
+        if not rides.admits(candidate):
             continue
         posted_mps = max(float(graph.limits_mps(own_way, candidate.path).min()), SLOWEST_MPS)
         wanted_mps = min(wanted_mps, posted_mps)
@@ -95,7 +117,7 @@ def place_followers(
         front_m = SIZES["car"].length_m / 2
         if red_gap_m(candidate.lights, front_m, begin_mps, 0) < stopping_m(begin_mps):
             continue
-        rides.append(candidate)
+        rides.add(candidate)
         name = f"car-{len(followers)}"
         followers.append(
             Follower(name, "car", candidate.path, 0.0, begin_mps, SIZES["car"], params)
@@ -108,12 +130,12 @@ def stopping_m(speed_mps: float) -> float:
     return speed_mps**2 / (2.0 * STOP_MPS2) + STOP_ROOM_M
 
 
-def _too_close(ride: _Ride, other: _Ride) -> bool:
+def _too_close(ride: Ride, other: Ride) -> bool:
     apart = ride.path.xyz[0] - other.path.xyz[0]
     return float(np.hypot(*apart[:2])) < ROOM_M and abs(float(apart[2])) < STACKED_M
 
 
-def _is_ruled(ride: _Ride, other: _Ride) -> bool:
+def _is_ruled(ride: Ride, other: Ride) -> bool:
     """Return whether it is clear who goes first where two ways cross or join; from one lane on,
     they follow each other. Nobody drives against another one on one lane.
     """
@@ -132,7 +154,7 @@ def _is_ruled(ride: _Ride, other: _Ride) -> bool:
     return all(_who_is_clear(ride, other, place, row[place]) for place in places)
 
 
-def _who_is_clear(ride: _Ride, other: _Ride, place: I64, other_place: I64) -> bool:
+def _who_is_clear(ride: Ride, other: Ride, place: I64, other_place: I64) -> bool:
     """Return whether a rule says who goes first where two ways come together.
 
     Args:
@@ -149,7 +171,7 @@ def _who_is_clear(ride: _Ride, other: _Ride, place: I64, other_place: I64) -> bo
     return sum(gives) == 1 and first is None and second is None
 
 
-def _gives_way(ride: _Ride, s_m: float, other: _Ride) -> bool:
+def _gives_way(ride: Ride, s_m: float, other: Ride) -> bool:
     """Return whether a line before a place holds a ride for another one."""
     return any(
         not line.signal.yields_to or not set(line.signal.yields_to).isdisjoint(other.way.lane_ids)

@@ -271,6 +271,7 @@ class MapSpec(Part):
     ] = field("Where to drive; random: drawn by the scene seed.", "random")
     vehicles: int = number(0, 100, "Vehicles near the route, which react (IDM).", 6)
     pedestrians: int = number(0, 100, "Pedestrians on crosswalks of the route.", 2)
+    cyclists: int = number(0, 100, "Cyclists near the route, who react as vehicles do.", 0)
     lane_changes: bool = field("Whether the vehicles change lanes (MOBIL).", False)
 
     @model_validator(mode="after")

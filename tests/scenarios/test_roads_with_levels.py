@@ -12,7 +12,7 @@ from alpasim_plugin.world.route import LaneIndex
 from policies.road_forecast import RoadForecast, RoadUser
 from scenarios.load import load_scenario
 from scenarios.map_route import LaneGraph, Way
-from scenarios.map_traffic import place_followers
+from scenarios.map_traffic import Rides, place_followers
 from scenarios.map_walkers import place_walkers
 from tests.data_sets import shared_folder
 from tests.files.opendrive_text import lane, road, section
@@ -33,7 +33,7 @@ def crossing(z_m, crosswalks=()):
 def followers(z_m, seed):
     lane_map = crossing(z_m)
     line = LaneGraph(lane_map.lanes).line(WAY)
-    placed = place_followers(lane_map, WAY, line, 4, stream("levels", seed, "vehicles"))
+    placed = place_followers(Rides(lane_map, WAY, line), 4, stream("levels", seed, "vehicles"))
     return [follower.path.xyz for follower in placed]
 
 
