@@ -62,7 +62,7 @@ class LogReplay(Policy):
     controller = "perfect"
 
     def __init__(self, scenario: Scenario) -> None:
-        self.log = _carried_on(scenario.ego_log, scenario.drive_until_us)
+        self.log = _carried_on(scenario.ego_log, scenario.end_us)
 
     def reset(self, seed: int, route: Route) -> None:
         """Do nothing: the plan depends on the time alone."""

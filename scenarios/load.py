@@ -231,7 +231,10 @@ def _window(draft: SceneDraft, drive: RecordedLog) -> tuple[int, int]:
     """Return the times of the first frame and of the end."""
     timing = draft.spec.timing
     first = int(drive.ego_log.t_us[0])
-    last = drive.goes_on_until_us or int(drive.ego_log.t_us[-1])
+    last = int(drive.ego_log.t_us[-1])
+    # Who does not stop at the goal gets the expert's time, unless the file states another.
+    if drive.goes_on_until_us and (timing.stop_at_path_end or timing.duration_us is not None):
+        last = drive.goes_on_until_us
     start = first + timing.start_us
     if draft.spec.road is not None:
         return start + timing.start_time_offset_us, draft.spec.built_until_us

@@ -622,14 +622,6 @@ class Scenario:
         return min(self.end_us, int(self.ego_log.t_us[-1]))
 
     @property
-    def drive_until_us(self) -> int:
-        """Give the last instant of a rollout. Who does not stop at a goal drives no longer than the
-        recorded drive.
-        """
-        passes_goal = self.path_end == "goal" and not self.stop_at_path_end
-        return self.recorded_until_us if passes_goal else self.end_us
-
-    @property
     def shown_files(self) -> list[str]:
         """Give the paths of what renderers and fixers read: Gaussians of the background and of
         actors, the files of a model, photographs.

@@ -62,7 +62,7 @@ from alpasim_plugin.log.schema import session_uuid
 from alpasim_plugin.runs.changes import changed_inputs
 from alpasim_plugin.runs.film import write_film
 from alpasim_plugin.runs.guards import calling
-from alpasim_plugin.runs.plan import Cell, RunOptions
+from alpasim_plugin.runs.plan import Cell, RunOptions, as_driven
 from alpasim_plugin.runs.recorder import Recorder
 from alpasim_plugin.runs.renderer import make_renderer
 from alpasim_plugin.runs.rollout import run_rollout
@@ -158,7 +158,7 @@ def run_cell(
     folder = root / cell.folder
     with _writing_manifest(cell, options, folder) as draft:
         planned = _scenario(cell) if load is None else load(cell.ref)
-        scenario = replace(planned, stop_at_path_end=cell.stops_at_path_end)
+        scenario = as_driven(planned, options.preset)
         with (
             parts_print_to_stderr(folder / OUTPUT_NAME),
             _same_folder(),
@@ -251,6 +251,7 @@ def copy_cell(
             **_begun_members(cell),
             preset=options.preset,
             stops_at_path_end=cell.stops_at_path_end,
+            most_steps=cell.most_steps,
             video=options.video,
             copied_from=original.path,
             session_uuid=session,
@@ -298,7 +299,12 @@ def _writing_manifest(cell: Cell, options: RunOptions, folder: Path) -> Iterator
     # OpenCV's pool is outside the thread budget, and frames are too small to gain from it.
     cv2.setNumThreads(1)
     draft = _Draft(_begun(cell))
-    draft.add(preset=options.preset, stops_at_path_end=cell.stops_at_path_end, video=options.video)
+    draft.add(
+        preset=options.preset,
+        stops_at_path_end=cell.stops_at_path_end,
+        most_steps=cell.most_steps,
+        video=options.video,
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # The manifest first: without it nothing is trusted.
@@ -506,20 +512,30 @@ def find_rollout_state(
         return "drive", state
     if cell.undigested and not reuse_undigested:
         return "drive", state
+    if not _ended_so(cell, manifest):
+        return "drive", state
     if not manifest.ok:
         return "none", state
-    # Presets that stop at the end of the path and those that drive on differ in these alone: who
-    # has passed it, and who had more time to come to a goal.
-    stops_alike = manifest.stops_at_path_end == cell.stops_at_path_end
-    had_its_time = cell.most_steps is None or manifest.steps == cell.most_steps
-    if not stops_alike and (manifest.passed_path_end or not had_its_time):
-        return "drive", state
     is_filmed = VIDEO_NAME in manifest.files or manifest.video == video
     if _wants_film(video, manifest) and not is_filmed:
         return "drive", state
     if state.action == "none" and not _is_scored_so(cell, manifest, reuse_undigested):
         return "score", state
     return state.action, state
+
+
+def _ended_so(cell: Cell, manifest: Manifest) -> bool:
+    """Tell whether a rollout ended where its cell would end: presets differ in whether they stop at the
+    end of the path, and in the time that they give in a scene with a goal.
+    """
+    stops_alike = manifest.stops_at_path_end == cell.stops_at_path_end
+    if stops_alike and manifest.most_steps == cell.most_steps:
+        return True
+    if not manifest.ok or manifest.steps is None or cell.most_steps is None:
+        return False  # what failed may have failed in time that the cell does not give
+    if manifest.passed_path_end:
+        return stops_alike and manifest.steps <= cell.most_steps
+    return manifest.steps == cell.most_steps
 
 
 def _is_scored_so(cell: Cell, manifest: Manifest, reuse_undigested: bool) -> bool:

@@ -208,7 +208,6 @@ def make_plan(
     evaluators = resolve_evaluators(options.evaluators)
     loop = package_digest()
     scoring = scoring_content(options.preset, evaluators)
-    stops = preset(options.preset).stop_at_path_end
     scenarios = {}
     sources: dict[str | None, str | None] = {}  # source of a recorded log -> digest of its code
     cells = []
@@ -224,8 +223,8 @@ def make_plan(
             parts[f"source of {scenario.scene_id}"] = sources[scenario.source_part]
             made_of = parts | {SIMRUN: loop} | _facts_of(scenario, seed, options)
             rollout_key = digest(made_of)
-            driven = replace(scenario, stop_at_path_end=scenario.stop_at_path_end and stops)
-            clock = Clock(driven.start_us, driven.drive_until_us, driven.rates)
+            driven = as_driven(scenario, options.preset)
+            clock = Clock(driven.start_us, driven.end_us, driven.rates)
             cells.append(
                 Cell(
                     renderer,
@@ -245,6 +244,22 @@ def make_plan(
                 )
             )
     return RunPlan(tuple(cells), scenarios, rendering, driving, tuple(seeds), options)
+
+
+def as_driven(scenario: Scenario, preset_name: str) -> Scenario:
+    """Return a scenario with the end that a preset gives its rollouts: whether they stop at the end
+    of the path, and up to when they last.
+
+    Raises:
+        InputError: Unknown preset.
+    """
+    chosen = preset(preset_name)
+    ends_by_expert = chosen.until_recorded and scenario.path_end == "goal"
+    return replace(
+        scenario,
+        stop_at_path_end=scenario.stop_at_path_end and chosen.stop_at_path_end,
+        end_us=scenario.recorded_until_us if ends_by_expert else scenario.end_us,
+    )
 
 
 def _facts_of(scenario: Scenario, seed: int, options: RunOptions) -> dict[str, str | None]:

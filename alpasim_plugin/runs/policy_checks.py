@@ -56,7 +56,7 @@ def frames_asked(policy: PartSpec, scenarios: Iterable[Scenario]) -> int:
             made = complete(make_policy(policy.name, scenario), Policy)
             built[key] = checked_sensors(made)
             made.close()
-        clock = Clock(scenario.start_us, scenario.drive_until_us, scenario.rates)
+        clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
         frames += CameraRig(scenario, built[key], clock).count()
     return frames
 

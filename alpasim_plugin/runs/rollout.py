@@ -100,7 +100,7 @@ class Loop:
         tells_road_users: bool = False,
     ) -> None:
         self._tells_road_users = tells_road_users
-        self._clock = clock = Clock(scenario.start_us, scenario.drive_until_us, scenario.rates)
+        self._clock = clock = Clock(scenario.start_us, scenario.end_us, scenario.rates)
         self._renderer, self._controller, self._recorder = (
             complete(renderer, Renderer),
             controller,
@@ -172,5 +172,7 @@ class Loop:
         recorded drive is over: the time beyond it is for those who are on their way.
         """
         axle_xy = self.state.ego.T_world_rig[:2, 3]
-        has_passed = self.path_end.ends_rollout(axle_xy)
-        return has_passed or (t_us >= self._recorded_until_us and self.path_end.is_lost(axle_xy))
+        if self.path_end.ends_rollout(axle_xy):
+            return True
+        is_on_its_way = t_us < self._recorded_until_us or self.path_end.passed
+        return not is_on_its_way and self.path_end.is_lost(axle_xy)

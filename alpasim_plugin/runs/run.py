@@ -45,7 +45,7 @@ from alpasim_plugin.runs.changes import rewritten_files
 from alpasim_plugin.runs.execute import HowToRun, Threads, execute, thread_budget
 from alpasim_plugin.runs.executor_choice import LOCAL, Executor
 from alpasim_plugin.runs.local_executor import prepare_workers
-from alpasim_plugin.runs.plan import RunPlan
+from alpasim_plugin.runs.plan import RunPlan, as_driven
 from alpasim_plugin.runs.policy_checks import check_policies, hanging
 from alpasim_plugin.runs.provenance import hardware, part_facts, project, versions
 from alpasim_plugin.runs.repeat import repeat_rollout
@@ -378,7 +378,9 @@ def run_info(plan: RunPlan, command: Sequence[str], threads: Threads) -> RunInfo
         policies=tuple(spec.name for spec in plan.policies),
         seeds=plan.seeds,
         scenes={
-            name: _scene_facts(scenario, refs[name], plan.options.device)
+            name: _scene_facts(
+                as_driven(scenario, plan.options.preset), refs[name], plan.options.device
+            )
             for name, scenario in plan.scenarios.items()
         },
         content=plan.content,

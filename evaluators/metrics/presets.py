@@ -109,6 +109,9 @@ class Preset:
     )
     # whether rows after the ego has come past the end of a recording that moves there are dropped
     ends_with_recording: bool = False
+    # whether a rollout in a scene with a goal is driven, and scored, up to the expert's arrival only:
+    # such rules compare the ego with the recorded drive at the same time
+    until_recorded: bool = False
     drop_black: bool = False  # a black image in a scored row removes the rollout
     # The loop, not the scores: whether a rollout ends at the end of its path, if its scenario says
     # so. AlpaSim drives on.
@@ -154,6 +157,7 @@ ALPASIM = Preset(
     has_scene_score=True,
     honour_valid=False,
     stop_beyond_gt_m=4.0,
+    until_recorded=True,
     drop_black=True,
     stop_at_path_end=False,
 )
@@ -184,7 +188,14 @@ PRESETS: dict[str, Preset] = {
     # Other benchmarks go on after an event, and have no score where a part of it cannot be
     # measured.
     **{
-        name: Preset(name=name, protocol=name, fault="nuplan", seam_m=0.1, stop_after=())
+        name: Preset(
+            name=name,
+            protocol=name,
+            fault="nuplan",
+            seam_m=0.1,
+            stop_after=(),
+            until_recorded=True,
+        )
         for name in ("nuplan", "navsim")
     },
 }

@@ -80,6 +80,9 @@ def score(
     """
     chosen = find_preset(preset)
     check_rollout(rollout)
+    if chosen.until_recorded and scene.path_end == "goal":
+        rollout = up_to(rollout, int(rollout.ego_log.t_us[-1]))
+        check_rollout(rollout)
     out: dict[str, MetricSeries] = {}
     specs = resolve_evaluators() if evaluators is None else evaluators
     metric_table = table_of(specs)
@@ -94,6 +97,33 @@ def score(
                 )
             out[metric_series.name] = metric_series
     return list(out.values())
+
+
+def up_to(rollout: RolloutLog, last_us: int) -> RolloutLog:
+    """Return a rollout as it would be had it ended at its last pose at a time or before: with what
+    was logged by then, and no plan of that pose. Road users who came later are left out.
+    """
+    ego = _poses_up_to(rollout.ego, last_us)
+    if len(ego) in (0, len(rollout.ego)):
+        return replace(rollout, ego=ego)
+    ended_us = int(ego.t_us[-1])
+    tracks = {name: _poses_up_to(actor.track, ended_us) for name, actor in rollout.actors.items()}
+    return replace(
+        rollout,
+        ego=ego,
+        actors={
+            name: replace(actor, track=tracks[name])
+            for name, actor in rollout.actors.items()
+            if len(tracks[name])
+        },
+        plans=tuple(plan for plan in rollout.plans if plan.now_us < ended_us),
+        images=tuple(image for image in rollout.images if image.start_us <= ended_us),
+    )
+
+
+def _poses_up_to(track: Trajectory, last_us: int) -> Trajectory:
+    rows = track.t_us <= last_us
+    return Trajectory(track.t_us[rows], track.xyz[rows], track.quat[rows])
 
 
 def run_evaluator(

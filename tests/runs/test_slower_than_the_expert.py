@@ -7,14 +7,16 @@ import pytest
 
 from alpasim_plugin.core.interfaces import Policy
 from alpasim_plugin.core.types import Plan
+from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cell import find_rollout_state
-from alpasim_plugin.runs.plan import RunOptions, make_plan
+from alpasim_plugin.runs.plan import RunOptions, as_driven, make_plan
 from alpasim_plugin.runs.rollout import run_rollout
 from alpasim_plugin.runs.run import execute_run
 from alpasim_plugin.runs.score_logs import check_complete
 from evaluators import rollout_values, score
 from evaluators.metrics.outcomes import OUTCOMES, REACHED
 from evaluators.metrics.presets import PRESETS
+from evaluators.metrics.score import up_to
 from policies.base import make_policy
 from scenarios.load import load_scenario
 from scenarios.suite import ScenarioRef
@@ -70,6 +72,19 @@ class Slow(Steady):
     share = 0.7
 
 
+class Fast(Steady):
+    share = 1.5
+
+
+class FailsLate(Steady):
+    share = 0.0
+
+    def act(self, observation):
+        if observation.t_us > 20_000_000:
+            raise ZeroDivisionError
+        return super().act(observation)
+
+
 class Standing(Steady):
     share = 0.0
 
@@ -108,10 +123,43 @@ def test_every_preset_scores_a_drive_that_lasts_longer_than_the_recorded_one(tmp
     log = run_rollout(scenario, Grey(), Slow(), 0).log()
     values = rollout_values(score(log, scenario.scene, preset), preset)
     odd = {name: v.value for name, v in values.items() if v.valid and not np.isfinite(v.value)}
-    allowed = {"min_distance_to_obstacle_m"}  # nobody else is there
-    if PRESETS[preset].aliases:  # their rules read steps that the recording does not cover
-        allowed |= {"dist_to_gt_location", "progress_rel"}
-    assert odd.keys() <= allowed
+    assert odd.keys() <= {"min_distance_to_obstacle_m"}  # nobody else is there
+
+
+IN_TIME = sorted(name for name, chosen in PRESETS.items() if chosen.until_recorded)
+
+
+@pytest.mark.parametrize("preset", IN_TIME)
+def test_who_is_compared_in_time_has_made_less_way_than_the_expert(tmp_path, preset):
+    scenario = scene(tmp_path)
+    log = run_rollout(scenario, Grey(), Slow(), 0).log()
+    shorter = run_rollout(as_driven(scenario, preset), Grey(), Slow(), 0).log()
+    assert shorter.ego.t_us[-1] <= scenario.recorded_until_us < log.ego.t_us[-1]
+    whole, cut = (
+        rollout_values(score(rollout, scenario.scene, preset), preset) for rollout in (log, shorter)
+    )
+    assert whole == cut
+    names = {"nuplan": "nuplan_progress", "navsim": "navsim_ep"}
+    made = whole[names.get(preset, "progress_rel")].value
+    assert 0.65 < made < 0.8
+
+
+def test_presets_that_compare_in_time_are_those_of_other_benchmarks():
+    assert IN_TIME == ["alpasim", "alpasim@6f1029c", "navsim", "nuplan"]
+
+
+def test_a_rollout_cut_at_a_time_has_nothing_of_later(tmp_path):
+    scenario = scene(tmp_path, "map.vehicles=6", seed=1)
+    log = run_rollout(scenario, Grey(), Slow(), 0).log()
+    last_us = int(log.ego.t_us[50]) + 1
+    cut = up_to(log, last_us)
+    assert cut.ego.t_us[-1] == log.ego.t_us[50]
+    assert len(cut.actors) > 0
+    assert all(actor.track.t_us[-1] <= last_us for actor in cut.actors.values())
+    assert [plan.now_us for plan in cut.plans] == [
+        plan.now_us for plan in log.plans if plan.now_us < log.ego.t_us[50]
+    ]
+    assert up_to(log, int(log.ego.t_us[-1])).plans == log.plans
 
 
 def test_who_never_moves_is_stopped_by_the_time_limit_and_has_stalled(tmp_path):
@@ -160,32 +208,78 @@ def test_a_duration_in_the_file_is_kept(tmp_path, seconds):
 
 
 def test_who_does_not_stop_at_the_goal_drives_as_long_as_the_expert(tmp_path):
-    scenario = replace(scene(tmp_path), stop_at_path_end=False)
+    scenario = scene(tmp_path, "timing.stop_at_path_end=false")
     why, log, _ = driven(scenario, Slow())
     assert why == "time"
     late_us = scenario.ego_log.t_us[-1] - log.ego.t_us[-1]
     assert 0 <= late_us < scenario.rates.control_us
 
 
-def test_a_rollout_that_had_longer_is_driven_again_where_the_preset_gives_less_time(tmp_path):
-    map_file(tmp_path)
-    (tmp_path / "map.yaml").write_text(
+def test_a_stated_duration_is_kept_where_a_drive_does_not_stop_at_the_goal(tmp_path):
+    stated = scene(
+        tmp_path,
+        "timing.duration_us=40000000",
+        "timing.stop_at_path_end=false",
+        "map.route.to=1:60",
+    )
+    log = run_rollout(stated, Grey(), Steady(), 0).log()
+    assert log.ego.t_us[-1] > stated.start_us + 40_000_000 - stated.rates.control_us
+
+
+def short_plan(folder, policy, preset):
+    """A run of one short scene, in which the expert drives 40 m."""
+    map_file(folder)
+    (folder / "map.yaml").write_text(
         "version: 1\n"
         'map: {opendrive: map.xodr, route: {from: "1:20", to: "1:60"}, vehicles: 0}\n'
         "timing: {start_us: 0}\n"
     )
-    standing = f"{__name__}:Standing"
+    refs = [ScenarioRef(str(folder / "map.yaml"))]
+    return make_plan(refs, (GREY,), (f"{__name__}:{policy}",), (0,), RunOptions(preset))
 
-    def plan(preset):
-        refs = [ScenarioRef(str(tmp_path / "map.yaml"))]
-        return make_plan(refs, (GREY,), (standing,), (0,), RunOptions(preset))
 
+def state_of(plan, out):
+    (cell,) = plan.cells
+    return find_rollout_state(cell, out)[0]
+
+
+def test_a_rollout_that_had_longer_is_driven_again_where_the_preset_gives_less_time(tmp_path):
     out = tmp_path / "run"
-    execute_run(plan("strict"), out, 1, ["simrun"], Announced(), report=False)
-    (again,) = plan("paper").cells
-    (shorter,) = plan("alpasim").cells
-    assert find_rollout_state(again, out)[0] == "score"
-    assert find_rollout_state(shorter, out)[0] == "drive"
+    plan = short_plan(tmp_path, "Standing", "strict")
+    execute_run(plan, out, 1, ["simrun"], Announced(), report=False)
+    assert state_of(short_plan(tmp_path, "Standing", "paper"), out) == "score"
+    for preset in IN_TIME:
+        assert state_of(short_plan(tmp_path, "Standing", preset), out) == "drive"
+
+
+def test_who_came_to_the_goal_in_the_experts_time_is_scored_again_where_it_stops_there(tmp_path):
+    out = tmp_path / "run"
+    plan = short_plan(tmp_path, "Fast", "nuplan")
+    execute_run(plan, out, 1, ["simrun"], Announced(), report=False)
+    assert state_of(short_plan(tmp_path, "Fast", "strict"), out) == "score"
+    assert state_of(short_plan(tmp_path, "Fast", "alpasim"), out) == "drive"
+
+
+def test_a_failure_behind_the_experts_arrival_is_none_of_a_preset_that_ends_there(tmp_path):
+    out = tmp_path / "run"
+    plan = short_plan(tmp_path, "FailsLate", "strict")
+    execute_run(plan, out, 1, ["simrun"], Announced(), report=False)
+    assert state_of(plan, out) == "none"
+    alpasim = short_plan(tmp_path, "FailsLate", "alpasim")
+    assert state_of(alpasim, out) == "drive"
+    execute_run(alpasim, tmp_path / "alone", 1, ["simrun"], Announced(), report=False)
+    assert state_of(alpasim, tmp_path / "alone") == "none"
+    manifest = find_rollout_state(alpasim.cells[0], tmp_path / "alone")[1].manifest
+    assert (manifest.ok, manifest.steps) == (True, manifest.most_steps)
+
+
+def test_a_plan_and_its_run_state_the_time_that_the_preset_gives(tmp_path):
+    plan = short_plan(tmp_path, "Standing", "alpasim")
+    execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), report=False)
+    (facts,) = read_run_json(tmp_path / "run").scenes.values()
+    (scenario,) = plan.scenarios.values()
+    seconds = (scenario.recorded_until_us - scenario.start_us) * 1e-6
+    assert facts.duration_s == pytest.approx(seconds)
 
 
 def test_traffic_goes_on_without_a_jump_and_without_contact_when_the_expert_has_arrived(tmp_path):
@@ -211,7 +305,6 @@ def test_traffic_goes_on_without_a_jump_and_without_contact_when_the_expert_has_
 @pytest.mark.parametrize("name", ["smoke/straight", "smoke/lead_car", "real/us101"])
 def test_scenes_without_a_goal_end_when_they_did(name):
     scenario = load_scenario(name)
-    assert scenario.drive_until_us == scenario.end_us
     assert scenario.recorded_until_us == scenario.end_us
 
 

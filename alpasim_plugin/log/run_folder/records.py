@@ -386,6 +386,7 @@ class Manifest(CellStatus):
         score_key: Digest of ``rollout_key`` and of everything that decides the scores.
         preset: Evaluator preset.
         stops_at_path_end: It was to stop at the end of the path.
+        most_steps: Control steps that it had time for.
         video: Which rollouts of the run get a film.
         inputs: Path of each file that was read while it was driven, beside what ``made_of`` holds ->
             digest.
@@ -428,6 +429,7 @@ class Manifest(CellStatus):
     score_key: str | None = None
     preset: str | None = None
     stops_at_path_end: bool | None = None
+    most_steps: int | None = None
     video: str | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     score_inputs: dict[str, str] = field(default_factory=dict)
