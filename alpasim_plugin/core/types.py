@@ -702,6 +702,8 @@ class RolloutLog:
     seed: int = 0  # of the rollout
     info: Mapping[str, Any] = field(default_factory=dict)  # facts that the writer stored besides
     warnings: tuple[str, ...] = ()  # what the reader noticed
+    # how far the ego had come along its recorded path by the first pose; None: as far as the recording
+    along_m: float | None = None
 
 
 @dataclass(frozen=True)

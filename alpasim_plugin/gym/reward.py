@@ -55,6 +55,7 @@ class Scorer:
         self._evaluators = [(spec.name, build(spec, preset=chosen)) for spec in specs]
         self._kinds = {actor.actor_id: actor for actor in scenario.actors}
         self._before: Instant | None = None
+        self._along_m: float | None = None
 
     def score(self, instants: Sequence[Instant]) -> tuple[float, str, dict[str, float]]:
         """Score what happened since the last call.
@@ -83,6 +84,7 @@ class Scorer:
         lateral_m = float(self._value(metrics["lateral_distance_m"])[-1])
         share = self._value(metrics["progress"])
         length_m = self._value(metrics["gt_dist_traveled_m"])
+        self._along_m = float(share[-1] * length_m[-1])
         collision, offroad = (
             bool((self._value(metrics[name])[0 if is_first else 1 :] > 0.5).any())
             for name in ("collision_any", "offroad")
@@ -137,4 +139,5 @@ class Scorer:
             render_start_us=start_us,
             force_gt_us=scenario.warmup_us,
             control_us=scenario.rates.control_us,
+            along_m=self._along_m,
         )

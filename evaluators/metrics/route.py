@@ -237,10 +237,16 @@ class OnRoute:
 
 
 def on_route(
-    path: F64, recorded_us: I64, t_us: I64, points: F64, more: F64 | None = None
+    path: F64,
+    recorded_us: I64,
+    t_us: I64,
+    points: F64,
+    more: F64 | None = None,
+    first_m: float | None = None,
 ) -> OnRoute:
     """Set points ``(T, 2)`` at times ``(T,)`` beside a recorded path ``(N, 2)`` with times
-    ``(N,)``, and beside what it goes on along, ``(M, 2)``.
+    ``(N,)``, and beside what it goes on along, ``(M, 2)``. The first one is sought about the arc length
+    ``first_m``; None: where the recording is at its time.
     """
     keep = moving(path)
     recorded = path[keep]
@@ -250,9 +256,9 @@ def on_route(
     if more is not None and len(more):
         line = np.concatenate([recorded, more])
     distance_m, s = to_path(line, points)
-    followed_m = followed(
-        line, distance_m, s, points, float(np.interp(t_us[0], recorded_us[keep], along))
-    )
+    if first_m is None:
+        first_m = float(np.interp(t_us[0], recorded_us[keep], along))
+    followed_m = followed(line, distance_m, s, points, first_m)
     at_end = followed_m >= length_m * (1 - 1e-12)
     over_m = (points - recorded[-1]) @ (recorded[-1] - _at(recorded, along, length_m - DIRECTION_M))
     is_beyond = (followed_m > length_m + STAND_M) | (at_end & (over_m > STAND_M * DIRECTION_M))
@@ -314,7 +320,7 @@ def evaluate_route(rollout: RolloutLog, scene: Scene | None, preset: Preset) -> 
     route = None
     if not preset.aliases:
         more = way_beyond(rollout, scene, preset)
-        route = on_route(drive.path, drive.path_us, drive.t_us, drive.ego, more)
+        route = on_route(drive.path, drive.path_us, drive.t_us, drive.ego, more, rollout.along_m)
     columns = _columns(rollout, preset, drive, route)
     if preset.invented_starts:
         own_path = rollout.ego.xyz[:, :2] - origin_of(rollout.ego_log, preset)[:2]

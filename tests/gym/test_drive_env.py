@@ -11,9 +11,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from alpasim_plugin.core.errors import InputError
-from alpasim_plugin.core.geometry import se2, se3
+from alpasim_plugin.core.geometry import quat_from_yaw, se2, se3
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import EgoState, Plan
+from alpasim_plugin.core.types import EgoState, Plan, Trajectory
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.schema import LOG_NAME
 from alpasim_plugin.runs.recorder import Recorder
@@ -171,6 +171,31 @@ def test_an_instant_off_the_road_counts_in_the_step_that_it_ends_only():
     assert ended == "offroad"
     _, ended, _ = scorer.score([(later, {})])
     assert ended == ""
+
+
+def test_progress_of_a_step_goes_on_from_the_step_before_when_the_recording_is_over():
+    scenario = load_scenario("smoke/straight")
+    x_m = np.arange(0.0, 100.0, 1.0)
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 20)
+    legs = [
+        np.column_stack([x_m, np.zeros(100)]),
+        np.column_stack([100.0 + 6.0 * np.cos(turn), 6.0 + 6.0 * np.sin(turn)]),
+        np.column_stack([x_m[::-1], np.full(100, 12.0)]),
+    ]
+    xyz = np.pad(np.concatenate(legs), ((0, 0), (0, 1)))
+    ahead = np.gradient(xyz[:, :2], axis=0)
+    first_us = int(scenario.ego_log.t_us[0])
+    t_us = first_us + 100_000 * np.arange(len(xyz), dtype=np.int64)
+    log = Trajectory(t_us, xyz, quat_from_yaw(np.arctan2(ahead[:, 1], ahead[:, 0])))
+    scorer = Scorer(replace(scenario, ego_log=log), "paper", Reward())
+    on_first_leg = [
+        EgoState(first_us + 700_000 * i, se2(float(i), 0.0, 0.0), 10.0) for i in range(62)
+    ]
+    worths = [scorer.score([(ego, {})]) for ego in on_first_leg]
+    gained = [worth for worth, _, _ in worths[1:]]
+    shares = [metrics["progress"] for _, _, metrics in worths]
+    assert gained == pytest.approx([0.1] * 61, abs=0.01)
+    assert np.diff(shares) == pytest.approx(np.full(61, 1.0 / 217.0), abs=1e-3)
 
 
 @pytest.mark.slow
