@@ -21,7 +21,7 @@ from alpasim_plugin.core.files.inputs import Inputs
 from alpasim_plugin.core.geometry import inverse, offset_trajectory
 from alpasim_plugin.core.json_types import JsonObject
 from alpasim_plugin.core.parts import PartSpec, require_installed
-from alpasim_plugin.core.path_end import ends_with_path
+from alpasim_plugin.core.path_end import PathEnd, ends_with_path
 from alpasim_plugin.core.types import MetricSeries, RolloutLog, Scenario, Scene
 from alpasim_plugin.log import read_asl
 from alpasim_plugin.log.run_folder.checksums import problem_of
@@ -264,8 +264,9 @@ def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
     """Refuse the log of a rollout that did not finish.
 
     A finished rollout has the number of control steps in its header after the first policy time, or
-    covers the recording. A rollout that the driver terminated is finished, and one whose last pose
-    is the first beyond the end of its path: ours end there.
+    covers the recording, which a scene with a goal goes on behind. A rollout that the driver terminated
+    is finished, and ours end with a pose that is the first beyond the end of the path, or lost when
+    the recording is over.
 
     Raises:
         InfrastructureError: The log ends earlier.
@@ -274,7 +275,8 @@ def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
         return
     first_us = int(rollout.ego.t_us[_first_policy_pose(rollout)])
     recorded = (int(rollout.ego_log.t_us[-1]) - first_us) // rollout.control_us
-    steps = min(int(rollout.info["n_steps"]) or recorded, recorded)
+    planned = int(rollout.info["n_steps"]) or recorded
+    steps = planned if scene.path_end == "goal" else min(planned, recorded)
     done = _steps(rollout)
     if done < steps and not _ends_with_the_path(rollout, scene):
         cut = f"; {rollout.warnings[0]}" if rollout.warnings else ""
@@ -286,6 +288,9 @@ def check_complete(log: Path, rollout: RolloutLog, scene: Scene) -> None:
 
 def _ends_with_the_path(rollout: RolloutLog, scene: Scene) -> bool:
     rig = offset_trajectory(rollout.ego, inverse(rollout.T_rig_box))
+    is_over = scene.path_end == "goal" and rig.t_us[-1] >= rollout.ego_log.t_us[-1]
+    if is_over and PathEnd(scene).is_lost(rig.xyz[-1, :2]):
+        return True
     return ends_with_path(rig.xyz[_first_policy_pose(rollout) :, :2], scene)
 
 

@@ -1,12 +1,15 @@
 """A scene on a map goes on behind the expert's arrival, so that a slower policy comes to the goal."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from alpasim_plugin.cli.main import run_command
+from alpasim_plugin.core.errors import InfrastructureError, InputError
 from alpasim_plugin.core.interfaces import Policy
-from alpasim_plugin.core.types import Plan
+from alpasim_plugin.core.types import Plan, Trajectory
 from alpasim_plugin.log.run_folder.manifests import read_run_json
 from alpasim_plugin.runs.cell import find_rollout_state
 from alpasim_plugin.runs.plan import RunOptions, as_driven, make_plan
@@ -115,6 +118,10 @@ def test_who_is_slower_than_the_expert_comes_to_the_goal(tmp_path):
     assert log.ego.t_us[-1] > scenario.ego_log.t_us[-1] + 5_000_000
     assert values["progress"].value >= REACHED
     check_complete(tmp_path, log, scenario.scene)
+    rows = np.flatnonzero(log.ego.t_us <= scenario.recorded_until_us + 2_000_000)
+    ego = Trajectory(log.ego.t_us[rows], log.ego.xyz[rows], log.ego.quat[rows])
+    with pytest.raises(InfrastructureError, match=r"of 595 control steps"):
+        check_complete(tmp_path, replace(log, ego=ego), scenario.scene)
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
@@ -179,6 +186,7 @@ def test_who_is_lost_gets_no_time_beyond_the_experts(tmp_path):
     assert "offroad" in outcomes(values)
     arrived_us = scenario.ego_log.t_us[-1]
     assert arrived_us <= log.ego.t_us[-1] < arrived_us + scenario.rates.control_us
+    check_complete(tmp_path, log, scenario.scene)
 
 
 def test_log_replay_ends_at_the_goal(tmp_path):
