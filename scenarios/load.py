@@ -33,6 +33,7 @@ from alpasim_plugin.core.types import (
     Rates,
     Route,
     Scenario,
+    Trajectory,
     Vehicle,
 )
 from alpasim_plugin.world.markings import with_default_markings
@@ -241,6 +242,7 @@ def _window(draft: SceneDraft, drive: RecordedLog) -> tuple[int, int]:
     if timing.timeline == "alpasim" and drive.first_frame_us is not None:
         start = drive.first_frame_us
     start += timing.start_time_offset_us
+    _check_first_frame(draft, drive.ego_log, start)
     end = last if timing.duration_us is None else start + timing.duration_us
     if end > last:
         fault = f"ends at {(end - first) / 1e6:.2f} s of a log {(last - first) / 1e6:.2f} s long"
@@ -248,6 +250,19 @@ def _window(draft: SceneDraft, drive: RecordedLog) -> tuple[int, int]:
             ("timing", "duration_us"), fault, "shorten timing.duration_us or leave it out"
         )
     return start, end
+
+
+def _check_first_frame(draft: SceneDraft, log: Trajectory, start_us: int) -> None:
+    """Check that a first frame that the file delays lies on the recorded drive."""
+    timing = draft.spec.timing
+    key = "start_us" if timing.start_us else "start_time_offset_us"
+    is_on_log = start_us + draft.spec.rates.control_us <= log.t_us[-1]
+    if is_on_log or not getattr(timing, key):
+        return
+    begin_s = (start_us - int(log.t_us[0])) * 1e-6
+    length_s = int(log.t_us[-1] - log.t_us[0]) * 1e-6
+    fault = f"the first frame is at {begin_s:.2f} s of a recorded drive {length_s:.2f} s long"
+    raise draft.document.error(("timing", key), fault, f"choose a smaller timing.{key}")
 
 
 def _actors(draft: SceneDraft, drive: RecordedLog) -> tuple[Actor, ...]:
@@ -326,6 +341,12 @@ def _check_timing(draft: SceneDraft, scenario: Scenario) -> None:
             ("timing", "start_time_offset_us"),
             fault,
             "set timing.start_us, or timing.timeline: alpasim",
+        )
+    recorded_us = (scenario.recorded_until_us - scenario.start_us) // control_us * control_us
+    if scenario.path_end == "goal" and warmup_us >= recorded_us:
+        fault = f"warmup_us = {warmup_us}, and the expert's drive ends after {recorded_us} us"
+        raise document.error(
+            ("timing", "warmup_us"), fault, "shorten timing.warmup_us or choose a longer route"
         )
     length_us = clock.n_steps * control_us
     if warmup_us >= length_us:

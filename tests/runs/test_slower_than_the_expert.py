@@ -234,6 +234,25 @@ def test_a_stated_duration_is_kept_where_a_drive_does_not_stop_at_the_goal(tmp_p
     assert log.ego.t_us[-1] > stated.start_us + 40_000_000 - stated.rates.control_us
 
 
+@pytest.mark.parametrize("stops", ["true", "false"])
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        (
+            "start_us",
+            r"timing\.start_us=30000000: the first frame is at 30\.00 s of a recorded drive",
+        ),
+        (
+            "warmup_us",
+            r"timing\.warmup_us=30000000: warmup_us = 30000000, and the expert's drive ends",
+        ),
+    ],
+)
+def test_a_drive_that_begins_behind_the_experts_arrival_is_refused(tmp_path, key, text, stops):
+    with pytest.raises(InputError, match=text):
+        scene(tmp_path, f"timing.{key}=30000000", f"timing.stop_at_path_end={stops}")
+
+
 def short_plan(folder, policy, preset):
     """A run of one short scene, in which the expert drives 40 m."""
     map_file(folder)
