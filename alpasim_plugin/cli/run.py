@@ -41,7 +41,7 @@ from alpasim_plugin.log.run_folder.schema import LOCK, OUTPUT_NAME
 from alpasim_plugin.runs.decide import SequentialTest, plan_of_two
 from alpasim_plugin.runs.execute import Threads, thread_budget
 from alpasim_plugin.runs.executor_choice import Executor, parse_executor
-from alpasim_plugin.runs.plan import RunOptions, RunPlan, make_plan
+from alpasim_plugin.runs.plan import RunOptions, RunPlan, as_driven, make_plan
 from alpasim_plugin.runs.policy_checks import frames_asked
 from alpasim_plugin.runs.repeat import repeat_line
 from alpasim_plugin.runs.run import RunResult, default_folder, execute_run, execute_search
@@ -422,7 +422,8 @@ def _print_decision(test: SequentialTest, root: Path, as_json: bool) -> None:
 
 def _print_plan(plan: RunPlan, root: Path, threads: Threads, as_json: bool) -> None:
     with parts_print_to_stderr():
-        frame_counts = [frames_asked(policy, plan.scenarios.values()) for policy in plan.policies]
+        scenarios = [as_driven(s, plan.options.preset) for s in plan.scenarios.values()]
+        frame_counts = [frames_asked(policy, scenarios) for policy in plan.policies]
     facts = {
         "out": str(root),
         "key": plan.command_key,

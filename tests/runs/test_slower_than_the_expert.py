@@ -300,6 +300,18 @@ def test_a_failure_behind_the_experts_arrival_is_none_of_a_preset_that_ends_ther
     assert (manifest.ok, manifest.steps) == (True, manifest.most_steps)
 
 
+def test_a_dry_run_counts_the_frames_of_the_time_that_the_preset_gives(tmp_path, capsys):
+    short_plan(tmp_path, "Standing", "strict")
+
+    def frames(preset):
+        parts = ["--renderer", "clean", "--policy", "lane-camera", "--preset", preset]
+        assert run_command([*parts, "--dry-run", "--json", str(tmp_path / "map.yaml")]) == 0
+        return json.loads(capsys.readouterr().out)["camera_frames"]
+
+    whole, cut = frames("strict"), frames("alpasim")
+    assert 0 < cut < whole / 3
+
+
 def test_a_plan_and_its_run_state_the_time_that_the_preset_gives(tmp_path):
     plan = short_plan(tmp_path, "Standing", "alpasim")
     execute_run(plan, tmp_path / "run", 1, ["simrun"], Announced(), report=False)
