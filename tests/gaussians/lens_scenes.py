@@ -12,7 +12,7 @@ from alpasim_plugin.gaussians.raster.lens_rays import (
     LENS_BEND,
     LENS_LEAST,
     LENS_SMALL,
-    tile_rays,
+    camera_lens,
 )
 from tests.gaussians.lens_reference import Motion
 
@@ -141,7 +141,7 @@ def largest_small(seen, count, seed):
     rays = seen.rays().reshape(-1, 3)
     distance = np.exp(rng.uniform(np.log(4), np.log(40), (count, 1)))
     p = rays[rng.integers(len(rays), size=count)] * distance
-    numbers = tile_rays(seen).lens
+    numbers = camera_lens(seen)
     low_pass = numbers[LENS_BEND] * 0.55 / numbers[LENS_LEAST]
     most = (numbers[LENS_SMALL] - low_pass) / (1 + numbers[LENS_BEND]) * distance
     assert (most > 0).all()

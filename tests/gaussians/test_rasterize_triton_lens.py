@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from alpasim_plugin.core.geometry import inverse
+from alpasim_plugin.core.types import LensModel
 from alpasim_plugin.gaussians import PinholeCamera, prepare, rasterize, rasterize_prepared
 from alpasim_plugin.gaussians.camera import Rolling
-from alpasim_plugin.gaussians.raster import rasterize_lens
+from alpasim_plugin.gaussians.lens_camera import LensCamera
+from alpasim_plugin.gaussians.raster import lens_rays, rasterize_lens
 from tests.gaussians.gaussian_scenes import LSB, assert_same_image
 from tests.gaussians.lens_reference import LensReference
 from tests.gaussians.lens_scenes import (
@@ -29,6 +31,7 @@ from tests.gaussians.lens_scenes import (
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
+from alpasim_plugin.gaussians.raster.lens_on_device import lens_numbers
 from alpasim_plugin.gaussians.raster.lens_records import INVERSE_O2
 from alpasim_plugin.gaussians.raster.rasterize_triton import DrawnCloud, UploadedClouds
 
@@ -172,6 +175,21 @@ def test_two_views_through_one_lens_are_those_of_the_cpu():
         assert_same_image(
             out, rasterize_prepared(placed, seen, threads=1, starts=starts), LSB, 1e-3
         )
+
+
+def test_the_numbers_of_many_lenses_are_made_once_and_without_tables_of_the_cpu():
+    cameras = []
+    for i in range(12):
+        wide = replace(spec("fisheye"), lens=LensModel("fisheye", (0.02 + 1e-3 * i,)))
+        cameras.append(LensCamera(wide, inverse(WORLD)))
+    tables = lens_rays._tile_rays.cache_info().misses
+    views = [(seen, []) for seen in cameras]
+    first = lens_numbers(views, 0.1).lenses
+    made = lens_rays._lens_numbers.cache_info().misses
+    np.testing.assert_array_equal(lens_numbers(views, 0.1).lenses, first)
+    assert len(np.unique(first, axis=0)) == len(cameras)
+    assert lens_rays._lens_numbers.cache_info().misses == made
+    assert lens_rays._tile_rays.cache_info().misses == tables
 
 
 def test_pinholes_of_a_rolling_shutter_are_those_of_the_cpu():

@@ -41,6 +41,7 @@ LENS_G = 32
 LENS_BEND = 47  # of a lens's image, radians a radian
 LENS_SLOPE = 48
 LENS_SIZE = 64
+KEPT_NUMBERS = 4096  # lenses whose numbers stay: 2 MB
 # A square of pixels: their rays' mean, its change to the right and down, and what these two miss.
 BLOCK_ROWS = 10
 MARGIN_PX = 0.02
@@ -64,14 +65,12 @@ class TileRays:
         alive: float32, 16 numbers a block: 1 where the lens sees anything, else -1.
         blocks: float32, `BLOCK_ROWS` x 16 numbers a tile: of its sixteen blocks.
         tiles: float32, as many for each sixteen tiles side by side: of these tiles.
-        lens: float64 ``(LENS_SIZE,)`` of a global shutter.
     """
 
     rays: F32
     alive: F32
     blocks: F32
     tiles: F32
-    lens: F64
 
 
 _of_cameras: WeakKeyDictionary[LensCamera, TileRays] = WeakKeyDictionary()
@@ -109,7 +108,6 @@ def _tile_rays(key: LensKey) -> TileRays:
         ).reshape(-1),
         _square_table(blocked),
         _tile_table(rays),
-        _lens_numbers(key),
     )
 
 
@@ -142,7 +140,9 @@ def _tile_table(rays: F32) -> F32:
     return _square_table(tiles.reshape(-1, 16, TILE, TILE, 3))
 
 
+@lru_cache(maxsize=KEPT_NUMBERS)
 def _lens_numbers(key: LensKey) -> F64:
+    """Return the numbers ``(LENS_SIZE,)`` of a lens with a global shutter."""
     spec = spec_of(key)
     mapped = lens_map(spec)
     numbers = np.zeros(LENS_SIZE)
@@ -161,6 +161,7 @@ def _lens_numbers(key: LensKey) -> F64:
     slope = np.polynomial.polynomial.polyder(polynomial) * (2 / mapped.s_most)
     numbers[LENS_G : LENS_G + len(polynomial)] = polynomial
     numbers[LENS_SLOPE : LENS_SLOPE + len(slope)] = slope
+    numbers.flags.writeable = False
     return numbers
 
 
@@ -193,7 +194,7 @@ def _bend(spec: CameraSpec, widest_rad: float) -> float:
 
 def camera_lens(camera: LensCamera) -> F64:
     """Return a camera's numbers ``(LENS_SIZE,)`` with its shutter."""
-    numbers = tile_rays(camera).lens.copy()
+    numbers = _lens_numbers(lens_key(camera.spec)).copy()
     if camera.rolling is not None:
         T_middle_start = camera.T_camera_world @ inverse(camera.rolling.T_camera_world_start)
         numbers[LENS_ROLLS] = 1.0
