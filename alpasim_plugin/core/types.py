@@ -204,7 +204,7 @@ class DevicePlanes(Protocol):
     rgb: Any  # (H, W, 3) uint8
     alpha: Any  # (H, W) float32
     depth: Any  # (H, W) float32
-    pairs: Any  # () int32, downloaded with what is made of the planes, and given to `had_room`
+    pairs: Any  # () int64, downloaded with what is made of the planes, and given to `had_room`
     references: Any  # (K, H, W, 4) uint8, recorded frames warped into the view; None: none
 
     @property

@@ -81,7 +81,7 @@ def test_a_scene_is_uploaded_once_and_a_frame_waits_when_it_is_read(monkeypatch)
         assert (np.abs(found.depth - wanted.depth) > 1e-3).mean() < 1e-3
     assert sum(traffic.waits.values()) == 1
     assert traffic.bytes_up < 3_000
-    assert traffic.bytes_down == 11 * found.alpha.size + 4
+    assert traffic.bytes_down == 11 * found.alpha.size + 8
     assert traffic.launches <= 40
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from alpasim_plugin.core.errors import InfrastructureError, InputError
+from alpasim_plugin.core.errors import InfrastructureError, InputError, RendererError
 from alpasim_plugin.gaussians import GaussianCloud, prepare, rasterize, rasterize_prepared
 from alpasim_plugin.gaussians.constants import MIP_PX2
 from alpasim_plugin.gaussians.raster.rasterize_reference import rasterize_reference
@@ -33,11 +33,19 @@ from tests.gaussians.hard_gradients import TOLERANCE
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
+import triton
+import triton.language as tl
+
 from alpasim_plugin.gaussians.raster.rasterize_triton import (
+    BLOCK,
+    MOST_PAIRS,
     DrawnCloud,
+    ProjectedSplats,
     TileCompositor,
     UploadedClouds,
 )
+from alpasim_plugin.gaussians.raster.triton_functions import slots_of
+from alpasim_plugin.gaussians.raster.triton_kernels import RECORD
 
 
 def interpreted(cloud, cam, behind=(0.0, 0.0, 0.0)):
@@ -135,6 +143,37 @@ def test_lists_that_outgrow_their_room_are_drawn_again():
     found = drawn(small, [(0, None)], camera(48, 32, 40.0))
     assert small.capacity > 10
     assert_same_image(found, interpreted(cloud, camera(48, 32, 40.0)), 0.0)
+
+
+def test_more_pairs_than_int32_counts_are_neither_cut_nor_taken_for_few():
+    """At 8192 x 8192 pixels there are 262,144 tiles: so many splats that meet all of them."""
+    nothing = torch.zeros(0)
+    counts = torch.full((8193,), 262_144, dtype=torch.int32)
+    count = int(ProjectedSplats(nothing, nothing, nothing, counts).pairs)
+    assert count == 8193 * 262_144 > MOST_PAIRS
+    lists = TileCompositor("cpu")
+    capacity = lists.capacity
+    assert not lists.had_room(capacity, count, views=2)  # each is drawn alone
+    assert lists.capacity == capacity
+    with pytest.raises(RendererError, match=str(count)):
+        lists.had_room(capacity, count)
+    assert not lists.had_room(capacity, MOST_PAIRS)
+    assert lists.capacity == MOST_PAIRS
+    assert lists.had_room(MOST_PAIRS, MOST_PAIRS)
+
+
+@triton.jit
+def write_first_numbers(out, blocks, BLOCK: tl.constexpr, RECORD: tl.constexpr):
+    slot = slots_of(tl.load(blocks), BLOCK)
+    tl.store(out + tl.arange(0, BLOCK), slot * RECORD)
+
+
+def test_records_beyond_two_billion_numbers_have_places_of_their_own():
+    first = 1_500_000  # of 128 Gaussians: 2.3e9 numbers stand before its records
+    out = torch.zeros(BLOCK, dtype=torch.int64)
+    blocks = torch.tensor([first], dtype=torch.int32)
+    write_first_numbers[(1,)](out, blocks, BLOCK=BLOCK, RECORD=RECORD)
+    assert torch.equal(out, (first * BLOCK + torch.arange(BLOCK)) * RECORD)
 
 
 def test_a_window_shows_what_the_whole_image_does():

@@ -22,7 +22,7 @@ class DeviceOutput(RasterOutput):
     """One rendered view, its planes as tensors.
 
     Attributes:
-        pairs: ``()`` int32, pairs of splat and tile; the planes are whole if the device had room
+        pairs: ``()`` int64, pairs of splat and tile; the planes are whole if the device had room
             for them.
         had_room: Whether there was room for a number of pairs; makes room for the next frame.
         again: Draws the view once more.

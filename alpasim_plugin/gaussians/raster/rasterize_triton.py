@@ -40,6 +40,7 @@ from alpasim_plugin.gaussians.raster.stages import node_poses, write_motion
 BLOCK = 128  # Gaussians that one program projects
 CHUNK = 32  # splats after which a tile is tested for being full
 FIRST_CAPACITY = 1 << 16  # pairs of splat and tile for which the first frame has room
+MOST_PAIRS = 2**31 - 1  # the kernels count the places in a launch's lists by int32
 HINT = "Install torch's CUDA build, which brings Triton, or choose --device cpu"
 
 
@@ -69,6 +70,11 @@ class ProjectedSplats(NamedTuple):
     depths: Tensor
     boxes: Tensor
     counts: Tensor
+
+    @property
+    def pairs(self) -> Tensor:
+        """Return ``()`` int64, the number of pairs of splat and tile."""
+        return self.counts.sum(dtype=torch.int64)
 
 
 class SplatLists(NamedTuple):
@@ -137,10 +143,24 @@ class TileCompositor:
         self.device = torch.device(require_device(device))
         self.capacity = FIRST_CAPACITY
 
-    def had_room(self, capacity: int, count: int) -> bool:
-        """Return whether lists of a capacity held so many pairs; make room for the next ones."""
-        if count > capacity:  # the lists were cut short
-            self.capacity = max(self.capacity, count + count // 4)
+    def had_room(self, capacity: int, count: int, views: int = 1) -> bool:
+        """Return whether lists of a capacity held so many pairs; make room for the next ones.
+
+        Args:
+            capacity: Pairs that the lists had room for.
+            count: Pairs of splat and tile, of all views.
+            views: Views that were drawn together; each of several may still be drawn alone.
+
+        Raises:
+            RendererError: One view has more than `MOST_PAIRS`.
+        """
+        if count > MOST_PAIRS and views == 1:
+            raise RendererError(
+                f"an image in which {count} pairs of splat and tile are drawn, of at most {MOST_PAIRS}",
+                "Render a smaller image or a scene of fewer Gaussians, or choose --device cpu",
+            )
+        if capacity < count <= MOST_PAIRS:  # the lists were cut short
+            self.capacity = max(self.capacity, min(count + count // 4, MOST_PAIRS))
         return count <= capacity
 
     def composite(
@@ -322,7 +342,7 @@ class UploadedClouds(TileCompositor):
         Raises:
             InputError: A transform is not rigid.
         """
-        had_room = partial(self.had_room, self.capacity)
+        had_room = partial(self.had_room, self.capacity, views=len(views))
         image, pairs = self._image(views, near_m)
         transmittance = image[..., 4]
         alpha = 1 - transmittance
@@ -355,7 +375,7 @@ class UploadedClouds(TileCompositor):
             splats = self._projected(views, spans, near_m)
             lens = None
         batch = self.composite(splats, camera, len(views), lens)
-        return batch.image, splats.counts.sum(dtype=torch.int32)
+        return batch.image, splats.pairs
 
     def _projected(
         self, views: Sequence[CloudView], spans: npt.NDArray[np.int32], near_m: float

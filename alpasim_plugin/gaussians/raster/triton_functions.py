@@ -159,6 +159,12 @@ def store_colours(sh_ptr, i, d, record, on_screen, SIZE: tl.constexpr):
 
 
 @triton.jit
+def slots_of(block, BLOCK: tl.constexpr):
+    """Return the slots of a block's Gaussians, int64: their places in tensors do not fit int32."""
+    return block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+
+
+@triton.jit
 def _tiles_between(low, high, count, TILE: tl.constexpr):
     """Return the first tile and the last + 1 that pixels ``low`` to ``high`` meet, in 0..count."""
     # Clamped as floats: a splat at 1e30 pixels has no tile number.

@@ -29,6 +29,7 @@ from alpasim_plugin.gaussians.raster.triton_functions import (
     offsets,
     pixels_of,
     scaled,
+    slots_of,
     store_colours,
     store_pixels,
     store_tiles,
@@ -170,7 +171,7 @@ def project(
     rows = _image_rows(camera, pose, slope_x, slope_y, z)
     factor = factor_rows(factors, i, visible)
     extent = tl.load(extents + i, present, 0.0)
-    slot = block * BLOCK + lane
+    slot = slots_of(block, BLOCK)
     record = records + slot * 12
     l11, l12, l22, kept, half_u, half_v = _ellipse(rows, factor, number(pose, _ANTIALIAS), extent)
     on_screen = store_tiles(

@@ -42,6 +42,7 @@ from alpasim_plugin.gaussians.raster.triton_functions import (
     offsets,
     pixels_of,
     scaled,
+    slots_of,
     store_colours,
     store_pixels,
     store_tiles,
@@ -727,8 +728,8 @@ def project_lens(
     p32 = as_f32(p)
     n32 = n.to(tl.float32)
     visible = visible & _in_cone(lens, p32, _reach(lens, pose, factor, n32, extent))
-    slot = block * BLOCK + lane
-    record = records + slot.to(tl.int64) * LENGTH
+    slot = slots_of(block, BLOCK)
+    record = records + slot * LENGTH
     small = visible & _is_small(lens, pose, factor, p32, n32)
     left = n32 * 0.0
     right = left
