@@ -244,7 +244,8 @@ def joined(camera: str, sides: Sequence[Lens], frames: Sequence[Frame]) -> Frame
 def joined_references(sides: Sequence[Lens], frames: Sequence[Frame]) -> tuple[U8, ...]:
     """Return the references of a lens's frame from those of its pinholes."""
     blank = np.zeros((1, 1, 4), dtype=np.uint8)
-    references = zip_longest(*(frame.references for frame in frames), fillvalue=blank)
+    of_pinholes = [frame.references_on_host() for frame in frames]
+    references = zip_longest(*of_pinholes, fillvalue=blank)
     return tuple(joined_image(sides, images, holds=True) for images in references)
 
 

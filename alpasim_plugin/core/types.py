@@ -277,6 +277,17 @@ class Frame:
         """The planes of a device, if the frame's image is theirs."""
         return self.on_device if self.is_pending("rgb") else None
 
+    def references_on_host(self) -> tuple[U8, ...]:
+        """Return the references as arrays, also those that a device holds: there they are carried once
+        more where the view lacked splats.
+        """
+        planes = self.on_device
+        if self.references or planes is None or planes.references is None:
+            return self.references
+        while not planes.had_room(int(planes.pairs)):
+            planes = planes.again()
+        return tuple(planes.references.cpu().numpy())
+
     @property
     def device(self) -> Any:
         """The device that drew it, also if its image was changed on the host since."""

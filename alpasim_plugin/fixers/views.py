@@ -184,7 +184,7 @@ def _stacked_references(frames: Sequence[Frame], size: tuple[int, int]) -> U8 | 
     """Return the references ``(F, K, H, W, 4)`` of frames, zeros where one has fewer than others;
     None where none has any.
     """
-    frame_references = [_references(frame) for frame in frames]
+    frame_references = [frame.references_on_host() for frame in frames]
     count = max(map(len, frame_references), default=0)
     if not count:
         return None
@@ -242,14 +242,6 @@ def _stack(
         joined([maps[i] for i in flat]).reshape(*lead, *shape) if maps else None,
         references,
     )
-
-
-def _references(frame: Frame) -> Sequence[U8]:
-    """Return the references of a frame on the host, also those of a frame that a device drew."""
-    planes = frame.pending
-    if planes is None or planes.references is None:
-        return frame.references
-    return tuple(planes.references.cpu().numpy())
 
 
 def planes_of(frames: Sequence[Frame]) -> list[DevicePlanes]:

@@ -183,6 +183,44 @@ def test_a_frame_its_references_and_its_map_stay_on_the_device(monkeypatch, capa
         assert launches[1] < 1.2 * launches[0]
 
 
+@pytest.mark.parametrize("capacity", [1 << 12, 10])
+def test_references_of_the_pinholes_that_cover_a_lens_reach_its_frame(monkeypatch, capacity):
+    """Of a renderer that draws no lenses and leaves its planes on the device, whose lists may be cut."""
+    graph, poses = scene()
+    pinhole = camera(32, 16)
+    T = np.linalg.inv(pinhole.T_camera_world)
+    shown = graph.render(pinhole, poses).surface()
+    rgb = (shown.rgb * 255).astype(np.uint8)
+    recorded = [RecordedFrame(0, "front", pinhole.K, T, {}, lambda: (rgb, shown.depth))]
+    path = Trajectory(np.arange(2), np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)))
+    narrow = replace(FISHEYE, max_angle_rad=0.7)
+    view = CameraSpec("front", 32, 16, pinhole.K, T, lens=narrow)
+    request = RenderRequest(100_000, view, np.stack([T, T]), {})
+
+    def rendered(requests, device):
+        views = [(camera_at(asked, asked.T_world_camera[1]), poses) for asked in requests]
+        drawn = zip(requests, graph.render_all(views, device=device), strict=True)
+        return [out.surface().frame(asked.t_us, asked.camera.name) for asked, out in drawn]
+
+    def references(device):
+        runner = BlockRunner(
+            partial(rendered, device=device),
+            None,
+            (),
+            references=ReferenceSession(recorded, (), path, 1),
+            on_device=True,
+            cover=LensCover([view]),
+        )
+        return runner.render([request])[0].frame.references
+
+    (wanted,) = references("cpu")
+    assert (wanted[..., 3] > 0).mean() > 0.2
+    with pretended_device(monkeypatch):
+        graph._upload("cuda:0", graph.background).clouds.capacity = capacity
+        (found,) = references("cuda:0")
+    assert (np.abs(found.astype(int) - wanted).max(axis=-1) > 2).mean() < 0.02
+
+
 @pytest.mark.parametrize("holes", first_of(["noise", "render"]))
 def test_the_fixer_waits_once_a_frame_and_replays_its_graph(monkeypatch, holes):
     settings = fixer_settings("onefixer", [f"holes={holes}"])
