@@ -813,8 +813,8 @@ def _rolling_q2(record, inverse_o2, d, time, lens, motion):
     z = s[0] * b - s[1] * a
     most = x * x + y * y + inverse_o2 * (z * z)
     across = tl.maximum(a * a + b * b, _TINY) * inverse_o2
-    ahead = tl.maximum(c, 0.0)
-    q2 = most / (ahead * ahead + across)
+    # A ray that leads away is nearest at its start. Seen backwards the equation has a second zero.
+    q2 = tl.where(c > 0.0, most / (c * c + across), 1.0 / inverse_o2)
     if tl.load(record + _PASSED) > 0:
         middle = 1.0 / tl.sqrt(inverse_o2)
         along = middle - s[2] * middle
