@@ -45,6 +45,7 @@ HIDING_M = 1e-3
 # recorded frame: coordinates in float64, colours, and the images of both depths.
 WORKING_BYTES = 1 << 30
 PIXEL_BYTES = 240
+LENS_PIXEL_BYTES = 300  # where the view or a recorded frame has a lens
 ABSENT = np.full((4, 4), np.nan)
 
 
@@ -159,7 +160,8 @@ def carry_on_device(views: Sequence[CarriedView]) -> Tensor:
     shared = size_of(views[0])
     height, width = shared.shape
     lenses = shared.lenses
-    together = max(1, WORKING_BYTES // (PIXEL_BYTES * height * width * sum(lenses)))
+    pixel_bytes = LENS_PIXEL_BYTES if shared.has_rays or shared.through_lens else PIXEL_BYTES
+    together = max(1, WORKING_BYTES // (pixel_bytes * height * width * sum(lenses)))
     starts = range(0, len(views), together)
     return torch.cat([_carry(views[i : i + together]) for i in starts])
 

@@ -1,12 +1,10 @@
 """Recorded frames carried by tensors: the same images as the kernels of the CPU."""
 
-import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from alpasim_plugin.core.geometry import se2
 from alpasim_plugin.core.types import Box
@@ -15,6 +13,7 @@ from alpasim_plugin.fixers.device_carry import CarriedView, carry_on_device, upl
 from alpasim_plugin.fixers.ground import carry, with_users
 from alpasim_plugin.fixers.warp import WarpTarget
 from tests.fixers.ground_cases import K, recorded, rig, street
+from tests.fixers.memory import Memory
 
 BOXES = {"car": Box(4.0, 2.0, 1.5), "van": Box(5.0, 2.2, 2.5)}
 
@@ -51,29 +50,6 @@ def test_images_equal_those_of_the_processor(count, wall_m, window_rad, monkeypa
         apart = np.abs(one.astype(int) - other)
         # A window at the first row of the ground ends at another row than the processor's.
         assert (apart.max(axis=-1) > 1).mean() <= (0.02 if wall_m < 99 and count > 1 else 0)
-
-
-class Memory(TorchDispatchMode):
-    """Counts the bytes of the storages that operations make, while they live."""
-
-    alive = most = 0
-
-    def __init__(self):
-        super().__init__()
-        self.known = weakref.WeakSet()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        made = func(*args, **(kwargs or {}))
-        storage = made.untyped_storage() if isinstance(made, torch.Tensor) else None
-        if storage is not None and storage not in self.known:
-            self.known.add(storage)
-            self.alive += storage.nbytes()
-            weakref.finalize(storage, self.freed, storage.nbytes())
-        self.most = max(self.most, self.alive)
-        return made
-
-    def freed(self, size):
-        self.alive -= size
 
 
 @pytest.mark.parametrize("count", [1, 3])

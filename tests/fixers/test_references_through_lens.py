@@ -176,6 +176,37 @@ def test_a_card_carries_frames_from_lens_to_lens_as_the_cpu_does(then, now):
         assert (apart > 1).mean() < 0.01
 
 
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(("then", "now"), [*PAIRS, ("opencv", "fisheye")])
+def test_views_through_lenses_are_carried_while_their_memory_holds_them(
+    then, now, count, monkeypatch
+):
+    pytest.importorskip("torch")
+    import torch
+
+    from alpasim_plugin.fixers import device_carry
+    from tests.fixers.memory import Memory
+
+    here = at(-0.8, 0.4, 0.0)
+    images = []
+    for i in range(count):
+        there = at(1.0 + 0.1 * i, -0.5, 0.5, 0.2)
+        depth_then = ball_depth(SPECS[then], there)
+        rgb = painted(points_of(SPECS[then], there, depth_then))
+        frame = with_users(recorded(SPECS[then], there, rgb, depth_then), {})
+        images.append(device_carry.upload_image(frame, torch.device("cpu")))
+    view = target(SPECS[now], here, ball_depth(SPECS[now], here))
+    rays = None if view.rays is None else torch.tensor(view.rays.transpose(2, 0, 1))
+    view = replace(view, depth=torch.from_numpy(view.depth), rays_on_device=rays)
+    below = se2(0.0, 0.0, 0.0, -1.5)
+    views = [device_carry.CarriedView(images, view, below)] * 4
+    room = 4.01 * count * W * H * device_carry.LENS_PIXEL_BYTES
+    monkeypatch.setattr(device_carry, "WORKING_BYTES", int(room))
+    with Memory() as memory:
+        device_carry.carry_on_device(views)
+    assert 0.4 * room < memory.most < room
+
+
 @pytest.mark.parametrize("name", LENSES)
 def test_a_frame_carried_into_the_lens_that_recorded_it_is_itself(name):
     spec, T = SPECS[name], at(3.0, 1.0, 0.3)
