@@ -261,7 +261,8 @@ class Frame:
     rgb: U8 = cast(U8, _Plane())  # (H, W, 3) sRGB
     # (H, W) opacity of what the renderer shows, 0..1: low where it has holes; sky counts as opaque
     alpha: F32 | None = cast(F32 | None, _Plane())
-    # (H, W) metres along the optical axis; 0 where no surface is, or it is less than half opaque
+    # (H, W) metres along the optical axis, through a lens from the camera's centre; 0 where no surface
+    # is, or it is less than half opaque
     depth: F32 | None = cast(F32 | None, _Plane())
     events: tuple[str, ...] = ()  # what a guard saw: "nan", "black", "frozen", ...
     # about this frame, for the log, such as "pose_error_m"

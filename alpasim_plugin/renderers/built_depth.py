@@ -29,8 +29,8 @@ class BuiltDepth:
         self.scenario, self.device, self.threads = scenario, device, threads
 
     def of_request(self, request: RenderRequest) -> F32:
-        """Return the depth ``(H, W)`` of a requested frame, metres along the optical axis at the
-        time of each pixel; 0 where the scene shows no surface.
+        """Return the depth ``(H, W)`` of a requested frame, metres along the optical axis, through
+        a lens from the camera's centre, at the time of each pixel; 0 where the scene shows no surface.
         """
         return draw_requests([request], self._draw)[0].on_host().depth
 
