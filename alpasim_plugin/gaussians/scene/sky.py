@@ -106,10 +106,11 @@ class Sky:
         panorama, px_per_rad, shares = self._uploaded[device]
         first = cameras[0]
         numbers = upload(np.stack([_seen_from(camera) for camera in cameras]), device)
+        rolls = any(camera.rolling is not None for camera in cameras)
         if isinstance(first, LensCamera):
-            window = _lens_places_on_device(numbers, first, device, px_per_rad)
+            window = _lens_places_on_device(numbers, first, device, px_per_rad, rolls)
         else:
-            window = _pinhole_places_on_device(numbers, first, device, px_per_rad)
+            window = _pinhole_places_on_device(numbers, first, device, px_per_rad, rolls)
         # OpenCV interpolates at the nearest 32nd of a pixel.
         window = (window * PARTS).round_().div_(PARTS)
         window[:, 0].remainder_(WIDTH)
@@ -203,27 +204,30 @@ def _seen_from(camera: PinholeCamera | LensCamera) -> F64:
     return np.concatenate([still.ravel(), place, time, (T_camera_ahead.T @ turned).ravel()])
 
 
-def _places_on_device(numbers: Tensor, pixels: Tensor, rays: Tensor, px_per_rad: Tensor) -> Tensor:
+def _places_on_device(
+    numbers: Tensor, rays: Tensor, px_per_rad: Tensor, pixels: Tensor | None
+) -> Tensor:
     """Return columns and rows of the panorama ``(V, 2, P)``, float32.
 
     Args:
         numbers: ``(V, 23)`` of `_seen_from`.
-        pixels: ``(3, P)``: u, v, 1.
         rays: ``(3, P)`` in the axes that the numbers are of.
         px_per_rad: `PX_PER_RAD`.
+        pixels: ``(3, P)``: u, v, 1; None where no shutter rolls.
     """
     import torch
 
-    time = (numbers[:, None, 11:14] @ pixels).clamp(-0.5, 0.5)
     ahead = numbers[:, :9].view(-1, 3, 3) @ rays
-    ahead = ahead + time * (numbers[:, 14:].view(-1, 3, 3) @ rays)
+    if pixels is not None:
+        time = (numbers[:, None, 11:14] @ pixels).clamp(-0.5, 0.5)
+        ahead = ahead + time * (numbers[:, 14:].view(-1, 3, 3) @ rays)
     x, y, z = ahead.unbind(1)
     angles = torch.stack([torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))], dim=2)
     return torch.addcmul(numbers[:, None, 9:11], angles, px_per_rad).float().mT
 
 
 def _pinhole_places_on_device(
-    numbers: Tensor, camera: PinholeCamera, device: str, px_per_rad: Tensor
+    numbers: Tensor, camera: PinholeCamera, device: str, px_per_rad: Tensor, rolls: bool
 ) -> Tensor:
     """Return `_places_on_device` at every pixel ``(V, 2, H, W)``, computed at `_corners` and
     interpolated in between.
@@ -232,7 +236,7 @@ def _pinhole_places_on_device(
 
     corners = _corners(camera.height, camera.width, device)
     flat = corners.flatten(1)
-    places = _places_on_device(numbers, flat, flat, px_per_rad)
+    places = _places_on_device(numbers, flat, px_per_rad, flat if rolls else None)
     coarse = places.reshape(-1, 2, *corners.shape[1:])
     finer = F.interpolate(coarse, scale_factor=STEP_PX, mode="bilinear", align_corners=False)
     first = STEP_PX // 2
@@ -240,14 +244,14 @@ def _pinhole_places_on_device(
 
 
 def _lens_places_on_device(
-    numbers: Tensor, camera: LensCamera, device: str, px_per_rad: Tensor
+    numbers: Tensor, camera: LensCamera, device: str, px_per_rad: Tensor, rolls: bool
 ) -> Tensor:
     """Return `_places_on_device` at every pixel of a lens ``(V, 2, H, W)``."""
     from alpasim_plugin.gaussians.raster.lens_on_device import rays_on_device
 
-    pixels = _pixels(camera.height, camera.width, device)
+    pixels = _pixels(camera.height, camera.width, device) if rolls else None
     rays = rays_on_device(camera.spec, device)[:3].flatten(1)
-    places = _places_on_device(numbers.float(), pixels, rays, px_per_rad.float())
+    places = _places_on_device(numbers.float(), rays, px_per_rad.float(), pixels)
     return places.reshape(-1, 2, camera.height, camera.width)
 
 
