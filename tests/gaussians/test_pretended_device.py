@@ -85,7 +85,13 @@ def test_a_scene_is_uploaded_once_and_a_frame_waits_when_it_is_read(monkeypatch)
     assert traffic.launches <= 40
 
 
-@pytest.mark.parametrize("lens", [None, FISHEYE], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize(
+    "lens",
+    [
+        pytest.param(None, id="pinhole"),
+        pytest.param(FISHEYE, id="fisheye", marks=pytest.mark.slow),
+    ],
+)
 def test_a_rolling_shutter_is_drawn_in_one_pass_as_on_the_cpu(monkeypatch, lens):
     graph, _ = scene()
     T = np.linalg.inv(camera().T_camera_world)

