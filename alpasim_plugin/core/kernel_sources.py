@@ -1,9 +1,10 @@
 """Which sources decide what a kernel computes: Numba freezes constants and other kernels into its
 machine code, and compares only the file that the kernel itself stands in.
 
-What a file says of itself is kept on disk under a hash of its content, since parsing the sources
-takes a tenth of the time that a command starts in: what has that content says the same, so nothing
-that is kept goes stale. Which file a name leads to is looked up each time.
+The names that a source file binds, imports and uses are stored on disk under a hash of the file's
+content, since parsing the sources takes a tenth of the time in which a command starts. A file with
+the same content has the same names, so a stored entry never becomes stale. Which file an imported
+name leads to is looked up each time.
 """
 
 import ast
